@@ -1,0 +1,55 @@
+# One target a task; `make run` and `make test` do all set-up that they need.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+BUF := npm exec --yes --package=@bufbuild/buf@1.75.0 -- buf
+# For example PIP_FLAGS="--extra-index-url https://download.pytorch.org/whl/cpu" for the CPU build of torch.
+PIP_FLAGS ?=
+PROTOC := PATH="$(CURDIR)/$(BIN):$$PATH" python -m grpc_tools.protoc
+PROTOS := $(wildcard proto/cab/forecast/v1/*.proto)
+
+.PHONY: install run test bench lint format proto proto-check proto-lint lock clean
+
+$(VENV)/.installed: pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) -c constraints.txt -e ".[dev]"
+	touch $@
+
+install: $(VENV)/.installed  ## make .venv with everything
+
+run: install  ## serve on 127.0.0.1:8080 (REST) and :50051 (gRPC); print one forecast
+	$(BIN)/cab-forecast serve --demo
+
+test: install lint proto-check  ## lint, types, drift of the generated code, all tests
+	$(BIN)/python -m pytest
+
+lint: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: install
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: install  ## speed of the forward, against this process's own matmul rate
+	$(BIN)/python -m model.bench
+
+proto: install  ## generate Python from proto/
+	$(PROTOC) -Iproto --python_out=proto --mypy_out=proto --grpc_python_out=proto \
+	  --mypy_grpc_out=proto $(PROTOS)
+
+proto-check: install  ## fail when the generated code is not what proto/ gives
+	@tmp=$$(mktemp -d) && trap 'rm -rf "$$tmp"' EXIT && \
+	$(PROTOC) -Iproto --python_out=$$tmp --mypy_out=$$tmp --grpc_python_out=$$tmp \
+	  --mypy_grpc_out=$$tmp $(PROTOS) && \
+	diff -r -x '*.proto' -x __init__.py -x __pycache__ -x py.typed $$tmp/cab proto/cab && echo "generated code is up to date"
+
+proto-lint:  ## buf lint; needs node
+	$(BUF) lint
+
+lock: install  ## write constraints.txt anew from what is installed
+	$(BIN)/python -m pip freeze --exclude-editable | sed 's/+cpu$$//' > constraints.txt
+
+clean:
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis

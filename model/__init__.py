@@ -1,0 +1,1 @@
+"""Motion forecasting without a server: scenes, states, networks, mixtures, physics, checkpoints."""

@@ -1,0 +1,29 @@
+"""Observations of agents as they come in: any rate, any length, with or without derivatives."""
+
+from dataclasses import dataclass
+
+from model.arrays import Floats, Ints
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Observations of N agents, at most S each, padded behind.
+
+    Within an agent times ascend strictly. Everything is finite but for the padding and for what was not
+    given, which is NaN. SI units, ground frame, seconds since the epoch.
+    """
+
+    count: Ints
+    """[N], observations of each agent, at least 1."""
+    time: Floats
+    """[N, S], s; +inf in the padding."""
+    position: Floats
+    """[N, S, 2], m."""
+    heading: Floats
+    """[N, S], rad."""
+    velocity: Floats
+    """[N, S, 2], m/s, ground frame."""
+    acceleration: Floats
+    """[N, S, 2], m/s², ground frame."""
+    heading_rate: Floats
+    """[N, S], rad/s."""

@@ -1,0 +1,95 @@
+"""What a forecaster sees: agents' states on the 0.5 s grid, and the map."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+from model.arrays import Bools, Bytes, Float32s, Floats, Ints
+
+STEP_SECONDS = 0.5
+"""Time between frames of history and between steps of a forecast (nuScenes keyframes, 2 Hz)."""
+
+
+class AgentType(StrEnum):
+    """Kinds of road users."""
+
+    VEHICLE = "vehicle"
+    PEDESTRIAN = "pedestrian"
+    CYCLIST = "cyclist"
+    UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True)
+class AgentStates:
+    """States of N agents on the grid time − k · 0.5 s, F frames, oldest first; the last one is now.
+
+    Frames before ``first`` are NaN. SI units, ground frame, float64: relative positions are formed by
+    subtraction before anything becomes float32.
+    """
+
+    position: Floats
+    """[N, F, 2], m."""
+    velocity: Floats
+    """[N, F, 2], m/s."""
+    acceleration: Floats
+    """[N, F, 2], m/s²."""
+    heading: Floats
+    """[N, F], rad in [-π, π); NaN where neither given nor to be told from motion."""
+    heading_rate: Floats
+    """[N, F], rad/s."""
+    first: Ints
+    """[N], the first frame from which on the agent was observed without a break; F: not observed now."""
+
+    @property
+    def frames(self) -> int:
+        """F."""
+        return self.position.shape[1]
+
+    @property
+    def observed(self) -> Bools:
+        """[N, F], whether the frame is there."""
+        return np.arange(self.frames)[None, :] >= self.first[:, None]
+
+    def last_frames(self, frames: int) -> "AgentStates":
+        """The newest ``frames`` frames only (all of them where there are fewer)."""
+        cut = max(self.frames - frames, 0)
+        return AgentStates(
+            position=self.position[:, cut:],
+            velocity=self.velocity[:, cut:],
+            acceleration=self.acceleration[:, cut:],
+            heading=self.heading[:, cut:],
+            heading_rate=self.heading_rate[:, cut:],
+            first=np.maximum(self.first - cut, 0),
+        )
+
+
+@dataclass(frozen=True)
+class Raster:
+    """The map of a scene: layers 0 driveable area, 1 road dividers, 2 lane dividers.
+
+    Element [layer, i, j] shows the ground point ``origin + (i, j) / pixels_per_meter``.
+    """
+
+    layers: Bytes
+    """[3, rows, columns], 0 or 1."""
+    origin: Floats
+    """[2], m."""
+    pixels_per_meter: float
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The agents of one place at one time, and its map."""
+
+    types: Sequence[AgentType]
+    """[N]."""
+    states: AgentStates
+    raster: Raster | None = None
+    patches: dict[int, Bytes | Float32s] = field(default_factory=dict)
+    """Agents' own map patches by agent index, each [3, 100, 100] in [0, 1]; they go before the raster."""
+
+    def of_type(self, kind: AgentType) -> Bools:
+        """[N], which agents are of that type."""
+        return np.array([t is kind for t in self.types], dtype=np.bool_)

@@ -1,0 +1,16 @@
+"""What all tests share."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder with golden files and real nuScenes data; it lies beside the checkout, never in it."""
+    here = Path(__file__).resolve().parents[1]
+    folder = Path(os.environ.get("CAB_FORECAST_SHARED", here.parent / "shared"))
+    if not folder.is_dir():
+        pytest.skip(f"golden files and real data are not here: {folder}")
+    return folder
