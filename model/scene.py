@@ -45,7 +45,7 @@ class AgentStates:
     @property
     def frames(self) -> int:
         """F."""
-        return self.position.shape[1]
+        return int(self.position.shape[1])
 
     @property
     def observed(self) -> Bools:
