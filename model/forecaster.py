@@ -77,7 +77,11 @@ class Forecaster(ABC):
 
     @abstractmethod
     def forecast(
-        self, features: Features, agent_type: AgentType, context: Context = Context.FULL, steps: int | None = None
+        self,
+        features: Features,
+        agent_type: AgentType,
+        context: Context = Context.FULL,
+        steps: int | None = None,
     ) -> TrajectoryMixture:
         """Mixtures of the agents in the features.
 
@@ -87,6 +91,10 @@ class Forecaster(ABC):
             context: full or blind.
             steps: T, at most ``info.steps``; default ``info.steps``.
         """
+
+    def requires_heading(self, agent_type: AgentType) -> bool:
+        """Whether an agent of that type cannot be forecast without a heading now."""
+        return False
 
     def __call__(
         self, scene: Scene, targets: Ints, context: Context = Context.FULL, steps: int | None = None

@@ -110,10 +110,13 @@ def cholesky_2x2(covariances: Tensor) -> Tensor:
     """Lower factors of positive (semi-)definite 2 × 2 matrices: [..., 2, 2] → [..., 2, 2].
 
     In closed form: rounding may leave a tiny negative pivot, which is cut at zero, where
-    ``torch.linalg.cholesky`` would raise.
+    ``torch.linalg.cholesky`` would raise. No element of a factor is larger than its row's standard
+    deviation, so a variance that has underflowed to zero does no harm either.
     """
     l11 = covariances[..., 0, 0].clamp_min(0).sqrt()
+    largest = covariances[..., 1, 1].clamp_min(0).sqrt()
     l21 = covariances[..., 1, 0] / l11.clamp_min(torch.finfo(covariances.dtype).tiny)
+    l21 = torch.maximum(torch.minimum(l21, largest), -largest)
     l22 = (covariances[..., 1, 1] - l21.square()).clamp_min(0).sqrt()
     zero = torch.zeros_like(l11)
     return torch.stack([torch.stack([l11, zero], dim=-1), torch.stack([l21, l22], dim=-1)], dim=-2)

@@ -1,0 +1,67 @@
+"""From a scene to the tensors that the networks take."""
+
+import numpy as np
+import torch
+
+from model.arrays import Float32s, Floats, Ints
+from model.forecaster import Context, Features
+from model.neighbors import edge_ramps, neighbor_sums
+from model.networks.config import NetworkConfig
+from model.raster import PATCH_SIZE, cut_patches
+from model.scene import AgentStates, AgentType, Scene
+from model.standardization import state_scale, state_vectors
+
+
+def scene_features(
+    scene: Scene, targets: Ints, agent_type: AgentType, config: NetworkConfig, context: Context
+) -> Features:
+    """Features of n agents of one type.
+
+    Returns:
+        ``origin`` [n, 2] float64, position now, m; everything else float32: ``history`` [n, F, D],
+        standardised own states, zero before ``first`` [n] (int64); ``velocity`` [n, 2], now, m/s; with
+        full context also, where the network uses them, ``neighbors.<type>`` [n, F, D_type], summed
+        standardised neighbour histories, ``edge_mask`` [n], and ``map`` [n, 3, 100, 100] in [-1, 1],
+        zeros where there is no map.
+    """
+    states = scene.states
+    features: dict[str, Floats | Float32s | Ints] = {
+        "origin": states.position[targets, -1],
+        "velocity": states.velocity[targets, -1].astype(np.float32),
+        "history": _own_history(states, targets, agent_type).astype(np.float32),
+        "first": states.first[targets],
+    }
+    if context is Context.FULL:
+        if config.neighbor_types:
+            mask = np.zeros(len(targets))
+            for other in config.neighbor_types:
+                neighbors = np.flatnonzero(scene.of_type(other))
+                edges = edge_ramps(states, targets, agent_type, neighbors, other)
+                sums = neighbor_sums(states, targets, agent_type, neighbors, other, edges)
+                features[f"neighbors.{other.value}"] = sums.astype(np.float32)
+                mask += edges.sum(axis=1)  # over every type: one mask for all of an agent's edges
+            features["edge_mask"] = np.minimum(mask, 1.0).astype(np.float32)
+        if config.looks_at_map(agent_type):
+            features["map"] = _maps(scene, targets)
+    return {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in features.items()}
+
+
+def _own_history(states: AgentStates, targets: Ints, agent_type: AgentType) -> Floats:
+    """[n, F, D], standardised, zero where not observed."""
+    history = state_vectors(states, agent_type)[targets]
+    history[..., :2] -= states.position[targets, -1][:, None, :]
+    history /= state_scale(agent_type, agent_type)
+    return np.nan_to_num(history, nan=0.0)
+
+
+def _maps(scene: Scene, targets: Ints) -> Float32s:
+    """[n, 3, 100, 100] in [-1, 1]: absent −1, present 1; 0, midway, where nothing is known."""
+    maps = np.zeros((len(targets), 3, PATCH_SIZE, PATCH_SIZE), dtype=np.float32)
+    own = np.array([int(target) in scene.patches for target in targets], dtype=np.bool_)
+    cut = ~own
+    if scene.raster is not None and cut.any():
+        states, seen = scene.states, targets[cut]
+        maps[cut] = 2 * cut_patches(scene.raster, states.position[seen, -1], states.heading[seen, -1]) - 1
+    for row in np.flatnonzero(own):
+        maps[row] = 2 * scene.patches[int(targets[row])].astype(np.float32) - 1
+    return maps

@@ -1,0 +1,70 @@
+"""Who is whose neighbour, and what of the neighbours the network sees."""
+
+import numpy as np
+
+from model.arrays import Floats, Ints
+from model.scene import AgentStates, AgentType
+from model.standardization import ATTENTION_RADIUS, STATE_SIZE, state_scale, state_vectors
+
+_RAMP = np.array([0.25, 0.5, 0.75, 1.0])
+"""Weights of presence now, 0.5 s ago, … 1.5 s ago: an edge fades in (Trajectron++, section 4.1)."""
+_PRESENCE = {AgentType.VEHICLE: 1.0, AgentType.PEDESTRIAN: 2.0}
+"""How much a neighbour's presence counts; the released code multiplies by the type's number."""
+
+
+def edge_ramps(
+    states: AgentStates, targets: Ints, own: AgentType, neighbors: Ints, other: AgentType
+) -> Floats:
+    """Strength of the edge from each neighbour to each target: [n, m] in [0, 1], 0 where there is none.
+
+    min(1, Σ_k f_k · a_{t−k}) over the last four frames, f = (0.25, 0.5, 0.75, 1); a is the type's
+    presence while the neighbour is within the attention radius, both observed; no edge when it is not
+    within it now.
+
+    Args:
+        states: of all agents of the scene.
+        targets: [n], indices of agents of type ``own``.
+        neighbors: [m], indices of agents of type ``other``.
+    """
+    frames = min(len(_RAMP), states.frames)
+    position = states.position[:, -frames:]
+    offset = position[targets][:, None] - position[neighbors][None]
+    distance = np.hypot(offset[..., 0], offset[..., 1])  # NaN where either is not observed
+    with np.errstate(invalid="ignore"):
+        inside = distance <= ATTENTION_RADIUS[own, other]
+    inside &= (targets[:, None] != neighbors[None, :])[..., None]
+    weights = _RAMP[:frames][::-1]  # the newest frame is the last
+    ramp = np.minimum(1.0, _PRESENCE[other] * (inside * weights).sum(axis=-1))
+    result: Floats = ramp * inside[..., -1]
+    return result
+
+
+def neighbor_sums(
+    states: AgentStates, targets: Ints, own: AgentType, neighbors: Ints, other: AgentType, edges: Floats
+) -> Floats:
+    """Sum of the connected neighbours' standardised histories: [n, F, STATE_SIZE[other]].
+
+    Relative to the target's state now in the dimensions that both types have. What was not observed of
+    a neighbour counts as zero after standardisation, so that the sum does not depend on where the
+    ground frame's origin is.
+
+    Args:
+        states: of all agents of the scene.
+        targets: [n], indices of agents of type ``own``.
+        neighbors: [m], indices of agents of type ``other``.
+        edges: [n, m], connected where > 0; the sum is not weighted by it.
+    """
+    size = STATE_SIZE[other]
+    history = state_vectors(states, other)[neighbors]
+    known = np.isfinite(history)
+    connected = (edges > 0).astype(np.float64)
+    common = min(size, STATE_SIZE[own])
+    present = np.zeros((len(targets), 1, size))
+    now = state_vectors(states.last_frames(1), own)[targets]
+    present[..., :common] = np.nan_to_num(now[..., :common])
+
+    # Σ_j c_ij (h_j − s_i), without an [n, m, F, D] array
+    total = np.tensordot(connected, np.where(known, history, 0.0), axes=1)
+    counted = np.tensordot(connected, known.astype(np.float64), axes=1)
+    result: Floats = (total - counted * present) / state_scale(own, other)
+    return result

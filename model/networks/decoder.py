@@ -1,0 +1,68 @@
+"""The decoder: one mode a latent category, a control Gaussian a step."""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from model.networks.config import DECODER_HIDDEN
+from model.networks.dynamics import Controls
+from model.networks.recurrent import GRUCell
+
+
+class ModeDecoder(nn.Module):
+    """A GRU unrolled for every latent category at once (Trajectron++, section 4.2).
+
+    Its input is [z, x, a]: the one-hot category, the encoding, and the control of the step before.
+    """
+
+    def __init__(self, modes: int, encoding_size: int, state_size: int) -> None:
+        super().__init__()
+        self.modes = modes
+        self.initial_h = nn.Linear(modes + encoding_size, DECODER_HIDDEN)
+        self.initial_action = nn.Linear(state_size, 2)
+        self.cell = GRUCell(modes + encoding_size + 2, DECODER_HIDDEN)
+        self.mean = nn.Linear(DECODER_HIDDEN, 2)
+        self.log_sigma = nn.Linear(DECODER_HIDDEN, 2)
+        self.correlation = nn.Linear(DECODER_HIDDEN, 1)
+
+    def forward(self, encoding: Tensor, state_now: Tensor, steps: int) -> Controls:
+        """Controls of all modes; each step's mean is fed back into the next.
+
+        Args:
+            encoding: [N, X].
+            state_now: [N, D], standardised.
+            steps: T.
+
+        Returns:
+            [N, K, T] each.
+        """
+        agents, modes, split = len(encoding), self.modes, 2 * DECODER_HIDDEN
+        bias = self.cell.bias_ih.clone()
+        bias[:split] += self.cell.bias_hh[:split]
+        w_z, w_x, w_a = self.cell.weight_ih.split([modes, encoding.shape[1], 2], dim=1)
+        constant = self._outer(w_z, F.linear(encoding, w_x, bias))
+        gates, new = constant[:, :split].contiguous(), constant[:, split:].contiguous()
+        w_gates, w_new = w_a[:split].T, w_a[split:].T
+        h_z, h_x = self.initial_h.weight.split([modes, encoding.shape[1]], dim=1)
+        hidden = self._outer(h_z, F.linear(encoding, h_x, self.initial_h.bias))
+        action = self.initial_action(state_now).repeat_interleave(modes, dim=0)
+        weight = torch.cat([self.mean.weight, self.log_sigma.weight, self.correlation.weight])
+        head_bias = torch.cat([self.mean.bias, self.log_sigma.bias, self.correlation.bias])
+
+        outputs = []
+        for _ in range(steps):
+            hidden = self.cell(torch.addmm(gates, action, w_gates), torch.addmm(new, action, w_new), hidden)
+            outputs.append(F.linear(hidden, weight, head_bias))
+            action = outputs[-1][:, :2]
+        # [5, N, K, T], contiguous: all that follows works on whole tensors of one quantity
+        stacked = torch.stack(outputs).permute(2, 1, 0).contiguous().unflatten(1, (agents, modes))
+        sigma = stacked[2:4].exp()
+        covariance = torch.tanh(stacked[4]) * sigma[0] * sigma[1]
+        return Controls(stacked[0], stacked[1], sigma[0].square(), covariance, sigma[1].square())
+
+    def _outer(self, by_mode: Tensor, by_agent: Tensor) -> Tensor:
+        """Every mode's column (z is one-hot: a look-up, no product) with every agent's row.
+
+        [H, K], [N, H] → [N·K, H].
+        """
+        return (by_agent[:, None, :] + by_mode.T[None, :, :]).flatten(0, 1)
