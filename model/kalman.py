@@ -1,0 +1,219 @@
+"""A constant-velocity Kalman filter over the last positions.
+
+State: position and velocity. Between frames the acceleration is white noise (Bar-Shalom, Li, Kirubarajan,
+"Estimation with Applications to Tracking and Navigation", 2001, section 6.2.2); positions are measured with
+white noise. The axes are independent and alike, so one 2 × 2 covariance of (position, velocity) serves both.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from model.arrays import Ints
+from model.forecaster import Context, Features, Forecaster, ModelInfo, Protocol
+from model.mixture import TrajectoryMixture
+from model.scene import STEP_SECONDS, AgentType, Scene
+from model.single import require_observed, single_mode, step_times
+
+HISTORY_FRAMES = 5
+"""Frames that the filter runs over: 2 s, the history of nuScenes' challenge."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What the filter assumes, for each axis."""
+
+    acceleration_density: float
+    """m²/s³, power spectral density of the white acceleration."""
+    measurement: float
+    """m, standard deviation of a measured position."""
+    given_velocity: float
+    """m/s, standard deviation of the velocity that an agent seen only once came with."""
+
+
+_VEHICLE = Noise(acceleration_density=1.087, measurement=0.080, given_velocity=1.0)
+NOISE: Mapping[AgentType, Noise] = {
+    AgentType.VEHICLE: _VEHICLE,
+    AgentType.PEDESTRIAN: Noise(acceleration_density=0.0268, measurement=0.032, given_velocity=0.3),
+    AgentType.CYCLIST: _VEHICLE,
+    AgentType.UNKNOWN: _VEHICLE,
+}
+"""Density and measurement noise: fitted for vehicles and pedestrians to the data that
+``model.uncertainty`` names, by minimising the same likelihood of the forecast positions at 0.5, 1, … 6 s.
+The velocity's and all of cyclists and unknown agents are assumptions."""
+
+
+class Kalman(Forecaster):
+    """One forecast for each agent: the filtered position carried on at the filtered velocity.
+
+    The covariance is that of the true position; noise of measuring it again is not in it. The first two
+    frames give the first state (their difference is the velocity). With one frame only, the velocity is the
+    one it came with, or zero.
+    """
+
+    info = ModelInfo(
+        name="kalman",
+        version="1.0.0",
+        protocol=Protocol.CAUSAL,
+        description="Constant-velocity Kalman filter over the last positions, with its predicted covariance.",
+        agent_types=tuple(AgentType),
+        context_types=(),
+        history_frames=HISTORY_FRAMES,
+        modes=1,
+        uses_map=False,
+        uses_neighbors=False,
+        supports_blind=True,
+        trained_on="noise only: nuScenes prediction train (vehicles), v1.0-mini (pedestrians)",
+        license="Apache-2.0",
+    )
+
+    def prepare(self, scene: Scene, targets: Ints, context: Context = Context.FULL) -> Features:
+        """``origin`` [n, 2], the position now; ``positions`` [n, 5, 2] relative to it, oldest first, zero
+        before ``first`` [n]; ``velocity`` [n, 2] now. Float64.
+
+        Raises:
+            ValueError: a target is not observed now.
+        """
+        states = scene.states.last_frames(HISTORY_FRAMES)
+        require_observed(states, targets)
+        missing = HISTORY_FRAMES - states.frames
+        origin = states.position[targets, -1]
+        # Always five frames, however many the scene has, so that scenes can be joined
+        positions = np.zeros((len(targets), HISTORY_FRAMES, 2))
+        positions[:, missing:] = np.nan_to_num(states.position[targets] - origin[:, None])
+        return {
+            "origin": torch.from_numpy(origin),
+            "positions": torch.from_numpy(positions),
+            "first": torch.from_numpy(states.first[targets].astype(np.int64) + missing),
+            "velocity": torch.from_numpy(np.nan_to_num(states.velocity[targets, -1])),
+        }
+
+    def forecast(
+        self,
+        features: Features,
+        agent_type: AgentType,
+        context: Context = Context.FULL,
+        steps: int | None = None,
+    ) -> TrajectoryMixture:
+        """One mode an agent; see the class. Context makes no difference.
+
+        Raises:
+            ValueError: steps outside 1 … 12.
+        """
+        noise = NOISE[agent_type]
+        time = step_times(self.info, steps).to(features["origin"].device)
+        state = _filter(features["positions"], features["first"], features["velocity"], noise)
+        mean = state.position[:, None] + time[:, None] * state.velocity[:, None]
+        variance = _predict(state, time, noise).var_position  # [N, T]
+        covariance = torch.diag_embed(variance[..., None].expand(-1, -1, 2))
+        return single_mode(mean, covariance, features["origin"])
+
+
+@dataclass(frozen=True)
+class _State:
+    """Filtered states of N agents."""
+
+    position: Tensor  # [N, 2]
+    velocity: Tensor  # [N, 2]
+    covariance: "_Covariance"
+
+
+@dataclass(frozen=True)
+class _Covariance:
+    """Of (position, velocity) along one axis, each [N] or [N, T]."""
+
+    var_position: Tensor
+    both: Tensor
+    var_velocity: Tensor
+
+
+def _predict(state: _State, time: Tensor, noise: Noise) -> _Covariance:
+    """The covariance a while later: [N, T] for times [T], s.
+
+    A sum of terms of which each is positive semi-definite, so it stays so.
+    """
+    now = state.covariance
+    position, both, velocity = now.var_position[:, None], now.both[:, None], now.var_velocity[:, None]
+    density = noise.acceleration_density
+    return _Covariance(
+        position + 2 * both * time + velocity * time**2 + density * time**3 / 3,
+        both + velocity * time + density * time**2 / 2,
+        velocity + density * time,
+    )
+
+
+def _filter(positions: Tensor, first: Tensor, velocity: Tensor, noise: Noise) -> _State:
+    """Runs over the frames from the first observed one on.
+
+    Args:
+        positions: [N, F, 2], m.
+        first: [N], first observed frame.
+        velocity: [N, 2], m/s, now; used where only the last frame is observed.
+        noise: of the agents' type.
+    """
+    frames = positions.shape[1]
+    state = _seen_once(positions[:, -1], velocity, noise)
+    for frame in range(1, frames):
+        starts, runs = first == frame - 1, first < frame - 1
+        started = _seen_twice(positions[:, frame - 1], positions[:, frame], noise)
+        updated = _update(state, positions[:, frame], noise)
+        state = _choose(starts, started, _choose(runs, updated, state))
+    return state
+
+
+def _seen_once(position: Tensor, velocity: Tensor, noise: Noise) -> _State:
+    """The state of an agent of which there is one position, and a velocity from elsewhere."""
+    one = torch.ones_like(position[:, 0])
+    return _State(
+        position, velocity, _Covariance(one * noise.measurement**2, 0 * one, one * noise.given_velocity**2)
+    )
+
+
+def _seen_twice(before: Tensor, now: Tensor, noise: Noise) -> _State:
+    """The state from two positions and nothing else (the filter's limit for an unknown first velocity)."""
+    one = torch.ones_like(now[:, 0])
+    measured = noise.measurement**2
+    velocity = 2 * measured / STEP_SECONDS**2 + noise.acceleration_density * STEP_SECONDS / 3
+    return _State(
+        now,
+        (now - before) / STEP_SECONDS,
+        _Covariance(one * measured, one * measured / STEP_SECONDS, one * velocity),
+    )
+
+
+def _update(state: _State, measured: Tensor, noise: Noise) -> _State:
+    """One frame on: prediction, then correction by the measured position [N, 2]."""
+    step = torch.full((1,), STEP_SECONDS, dtype=measured.dtype, device=measured.device)
+    ahead = _predict(state, step, noise)
+    position, both, velocity = ahead.var_position[:, 0], ahead.both[:, 0], ahead.var_velocity[:, 0]
+    expected = state.position + STEP_SECONDS * state.velocity
+    surprise = measured - expected
+    total = position + noise.measurement**2
+    gain_position, gain_velocity = position / total, both / total
+    return _State(
+        expected + gain_position[:, None] * surprise,
+        state.velocity + gain_velocity[:, None] * surprise,
+        # The usual (I − K H) P, written so that only the last number is a difference.
+        _Covariance(
+            gain_position * noise.measurement**2,
+            gain_velocity * noise.measurement**2,
+            (velocity - gain_velocity * both).clamp_min(0),
+        ),
+    )
+
+
+def _choose(mask: Tensor, one: _State, other: _State) -> _State:
+    """Agent by agent, the first state where the mask [N] is set, else the second."""
+    a, b = one.covariance, other.covariance
+    return _State(
+        torch.where(mask[:, None], one.position, other.position),
+        torch.where(mask[:, None], one.velocity, other.velocity),
+        _Covariance(
+            torch.where(mask, a.var_position, b.var_position),
+            torch.where(mask, a.both, b.both),
+            torch.where(mask, a.var_velocity, b.var_velocity),
+        ),
+    )

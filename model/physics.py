@@ -1,0 +1,163 @@
+"""The physics baselines: an agent goes on as it moves now.
+
+As in nuScenes' prediction baselines (nuscenes-devkit, ``prediction/models/physics.py``), with three
+differences. A turn is the exact arc, not a polygon of Euler steps. Agents that brake stop and stay, where
+the devkit lets them reverse and speed up backwards. The direction of travel is that of the velocity, and
+the heading only tells it for an agent that stands; so one that reverses goes on reversing, where the devkit
+drives it forwards.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from model import uncertainty
+from model.arrays import Ints
+from model.forecaster import Context, Features, Forecaster, ModelInfo, Protocol
+from model.mixture import TrajectoryMixture
+from model.scene import AgentType, Scene
+from model.single import require_observed, single_mode, step_times
+from model.uncertainty import Spread, aligned_covariance
+
+STANDING_SPEED = 1e-6
+"""m/s; up to it the velocity has no direction, and the agent would set off along its heading."""
+HEADING_SPEED = 0.5
+"""m/s; below it the stated ellipse lies along the heading: the velocity's direction is mostly noise."""
+
+_SERIES_LIMIT = 1e-2
+"""rad; below it the arc's second integral is summed as a series, exact to a double's last digits."""
+
+
+class Physics(Forecaster):
+    """One forecast for each agent: constant velocity or acceleration, constant yaw or yaw rate.
+
+    The acceleration is that along the direction of travel, held until the agent stops. What is not known
+    (NaN) of velocity, acceleration and heading rate counts as zero; an unknown heading is the direction of
+    the velocity. The covariance is ``uncertainty``'s, aligned with the direction of travel at each step.
+
+    Args:
+        name: of the model.
+        accelerates: whether the acceleration goes on; else the speed stays.
+        turns: whether the heading rate goes on; else the direction stays.
+        spread: how the error grows, by agent type.
+    """
+
+    def __init__(self, name: str, accelerates: bool, turns: bool, spread: Mapping[AgentType, Spread]) -> None:
+        self._accelerates = accelerates
+        self._turns = turns
+        self._spread = spread
+        speed = "acceleration along the direction of travel" if accelerates else "speed"
+        course = "heading rate" if turns else "direction of travel"
+        self.info = ModelInfo(
+            name=name,
+            version="1.0.0",
+            protocol=Protocol.CAUSAL,
+            description=f"Physics: keeps {speed} and {course}; states how far such forecasts are off.",
+            agent_types=tuple(AgentType),
+            context_types=(),
+            history_frames=1,
+            modes=1,
+            uses_map=False,
+            uses_neighbors=False,
+            supports_blind=True,
+            trained_on="covariance only: nuScenes prediction train (vehicles), v1.0-mini (pedestrians)",
+            license="Apache-2.0",
+        )
+
+    def prepare(self, scene: Scene, targets: Ints, context: Context = Context.FULL) -> Features:
+        """The present state, float64: ``position``, ``velocity``, ``acceleration`` [n, 2], ``heading`` (NaN
+        where unknown) and ``heading_rate`` [n].
+
+        Raises:
+            ValueError: a target is not observed now.
+        """
+        states = scene.states
+        require_observed(states, targets)
+        return {
+            "position": torch.from_numpy(states.position[targets, -1]),
+            "velocity": torch.from_numpy(np.nan_to_num(states.velocity[targets, -1])),
+            "acceleration": torch.from_numpy(np.nan_to_num(states.acceleration[targets, -1])),
+            "heading": torch.from_numpy(states.heading[targets, -1]),
+            "heading_rate": torch.from_numpy(np.nan_to_num(states.heading_rate[targets, -1])),
+        }
+
+    def forecast(
+        self,
+        features: Features,
+        agent_type: AgentType,
+        context: Context = Context.FULL,
+        steps: int | None = None,
+    ) -> TrajectoryMixture:
+        """One mode an agent; see the class. Context makes no difference.
+
+        Raises:
+            ValueError: steps outside 1 … 12.
+        """
+        time = step_times(self.info, steps).to(features["position"].device)
+        velocity, heading = features["velocity"], features["heading"]
+        speed = velocity.norm(dim=-1)
+        course = torch.atan2(velocity[:, 1], velocity[:, 0])
+        known = heading.isfinite()
+        course = torch.where((speed <= STANDING_SPEED) & known, heading, course)
+
+        moving, acceleration = time.expand(len(speed), -1), torch.zeros_like(speed)
+        if self._accelerates:
+            along = torch.stack([course.cos(), course.sin()], dim=-1)
+            acceleration = (features["acceleration"] * along).sum(-1)
+            moving = torch.minimum(moving, _time_to_stop(speed, acceleration)[:, None])
+        rate = features["heading_rate"] if self._turns else torch.zeros_like(speed)
+        turned = rate[:, None] * moving
+        offset = _rotate(_travel(speed[:, None], acceleration[:, None], moving, turned), course[:, None])
+
+        axis = torch.where((speed < HEADING_SPEED) & known, heading, course)
+        covariance = aligned_covariance(self._spread[agent_type], time, axis[:, None] + turned)
+        return single_mode(offset, covariance, features["position"])
+
+
+def baselines() -> Sequence[Physics]:
+    """The four of nuScenes."""
+    return (
+        Physics("constant-velocity-yaw", False, False, uncertainty.CONSTANT_VELOCITY_YAW),
+        Physics("constant-speed-yaw-rate", False, True, uncertainty.CONSTANT_SPEED_YAW_RATE),
+        Physics("constant-acceleration-yaw", True, False, uncertainty.CONSTANT_ACCELERATION_YAW),
+        Physics("constant-acceleration-yaw-rate", True, True, uncertainty.CONSTANT_ACCELERATION_YAW_RATE),
+    )
+
+
+def _time_to_stop(speed: Tensor, acceleration: Tensor) -> Tensor:
+    """[N], s; infinite for an agent that does not brake."""
+    braking = acceleration < 0
+    return torch.where(braking, speed / torch.where(braking, -acceleration, 1.0), torch.inf)
+
+
+def _travel(speed: Tensor, acceleration: Tensor, time: Tensor, turned: Tensor) -> Tensor:
+    """Way travelled from rest at the origin's heading 0: ∫ (speed + acceleration · τ) e^{i ω τ} dτ over time.
+
+    Args:
+        speed: [N, 1], m/s, at time 0.
+        acceleration: [N, 1], m/s².
+        time: [N, T], s.
+        turned: [N, T], rad, ω · time.
+
+    Returns:
+        [N, T, 2], m.
+    """
+    # ∫ e^{i x u} du over [0, 1] is the chord of the arc: sinc(x/2) long, at the angle x/2.
+    chord = torch.special.sinc(turned / (2 * torch.pi))
+    first = torch.stack([chord * torch.cos(turned / 2), chord * torch.sin(turned / 2)], dim=-1)
+    # ∫ u e^{i x u} du, by parts; the closed form cancels where x is small.
+    small = turned.abs() < _SERIES_LIMIT
+    x = torch.where(small, 1.0, turned)
+    real = torch.where(small, 1 / 2 - turned**2 / 8 + turned**4 / 144, (x.cos() + x * x.sin() - 1) / x**2)
+    imaginary = torch.where(small, turned / 3 - turned**3 / 30, (x.sin() - x * x.cos()) / x**2)
+    second = torch.stack([real, imaginary], dim=-1)
+    return (speed * time)[..., None] * first + (acceleration * time**2)[..., None] * second
+
+
+def _rotate(vectors: Tensor, angle: Tensor) -> Tensor:
+    """Vectors [N, T, 2] turned counter-clockwise by the angle [N, 1], rad."""
+    x, y = vectors[..., 0], vectors[..., 1]
+    cos, sin = angle.cos(), angle.sin()
+    return torch.stack([cos * x - sin * y, sin * x + cos * y], dim=-1)

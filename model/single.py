@@ -1,0 +1,56 @@
+"""What baselines that forecast a single trajectory share."""
+
+import torch
+from torch import Tensor
+
+from model.arrays import Ints
+from model.forecaster import ModelInfo
+from model.mixture import TrajectoryMixture
+from model.scene import STEP_SECONDS, AgentStates
+
+
+def require_observed(states: AgentStates, targets: Ints) -> None:
+    """Refuses agents without a present.
+
+    Args:
+        states: of the scene.
+        targets: [n], indices of agents.
+
+    Raises:
+        ValueError: a target is not observed now.
+    """
+    absent = targets[states.first[targets] >= states.frames]
+    if len(absent):
+        raise ValueError(f"agents {absent.tolist()} are not observed now, so they cannot be forecast")
+
+
+def step_times(info: ModelInfo, steps: int | None) -> Tensor:
+    """When the steps of a forecast are: [T] float64, s ahead.
+
+    Args:
+        info: of the model.
+        steps: T; None for all that the model has.
+
+    Raises:
+        ValueError: steps outside 1 … info.steps.
+    """
+    count = info.steps if steps is None else steps
+    if not 1 <= count <= info.steps:
+        raise ValueError(f"steps must be in 1 … {info.steps}, not {count}")
+    return STEP_SECONDS * torch.arange(1, count + 1, dtype=torch.float64)
+
+
+def single_mode(means: Tensor, covariances: Tensor, origin: Tensor) -> TrajectoryMixture:
+    """A mixture of one mode.
+
+    Args:
+        means: [N, T, 2], m, relative to origin.
+        covariances: [N, T, 2, 2], m².
+        origin: [N, 2] float64, m, ground frame.
+    """
+    return TrajectoryMixture(
+        log_weights=torch.zeros(len(means), 1, device=means.device),
+        means=means[:, None].float(),
+        covariances=covariances[:, None].float(),
+        origin=origin,
+    )
