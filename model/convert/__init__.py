@@ -1,0 +1,6 @@
+"""Import of weights that others published."""
+
+from model.convert.errors import ConversionError, UnsafePickleError
+from model.convert.trajectron import convert_trajectron
+
+__all__ = ["ConversionError", "UnsafePickleError", "convert_trajectron"]

@@ -1,0 +1,149 @@
+"""Torch's file format of before version 1.6, read into numpy arrays.
+
+Five pickles, one behind the other (magic number, format version, facts on the writing machine, the object,
+the keys of its storages), then each storage: its length as int64, and its raw little-endian numbers
+(``torch/serialization.py``, ``_legacy_save``).
+"""
+
+import io
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from model.arrays import Float32s
+from model.convert.errors import ConversionError
+from model.convert.unpickling import TORCH_MODULES, InertModule, StorageRef, TensorRef, unpickle
+
+MAX_FILE_BYTES = 1 << 29
+"""Larger files are refused (Trajectron++ takes 1.3 MB)."""
+MAX_DEPTH = 16
+"""Modules within modules."""
+MAX_MODULES = 10_000
+
+_MAGIC = 0x1950A86A20F9469CFC6C
+_FORMAT_VERSION = 1001
+_ZIP_MAGIC = b"PK\x03\x04"
+
+
+def read_parameters(file: Path) -> dict[str, Float32s]:
+    """The parameters of a pickled module tree.
+
+    Args:
+        file: of torch's legacy format, holding one nn.Module.
+
+    Returns:
+        Arrays by name, as ``state_dict`` would name them.
+
+    Raises:
+        UnsafePickleError: it names something that is not known to be harmless; nothing was run.
+        ConversionError: it is not such a file, or damaged.
+    """
+    try:
+        return _parameters(_load(file))
+    except ConversionError as error:
+        raise type(error)(f"{file}: {error}") from error
+    except OSError as error:
+        raise ConversionError(f"{file}: cannot be read: {error.strerror}") from error
+
+
+def _load(file: Path) -> io.BytesIO:
+    size = file.stat().st_size
+    if size > MAX_FILE_BYTES:
+        raise ConversionError(f"{size} bytes are too many; at most {MAX_FILE_BYTES} are read")
+    data = file.read_bytes()
+    if data.startswith(_ZIP_MAGIC):
+        raise ConversionError(
+            "this is a zip archive, the format of torch since 1.6; only legacy files are read "
+            "(torch.save(..., _use_new_zipfile_serialization=False) writes them)"
+        )
+    return io.BytesIO(data)
+
+
+def _parameters(stream: io.BytesIO) -> dict[str, Float32s]:
+    if unpickle(stream, {}) != _MAGIC:
+        raise ConversionError("this is not a file of torch: the magic number is missing")
+    if unpickle(stream, {}) != _FORMAT_VERSION:
+        raise ConversionError("this file is not of torch's legacy format version 1001")
+    system = unpickle(stream, {})
+    if not isinstance(system, dict) or system.get("little_endian") is not True:
+        raise ConversionError("the file was not written by a little-endian machine")
+    root = unpickle(stream, TORCH_MODULES)
+    references = dict(_walk(root))
+    storages = _storages(stream)
+    budget = sum(map(len, storages.values()))
+    parameters = {}
+    for name, reference in references.items():
+        array = _tensor(name, reference, storages)
+        budget -= array.size
+        if budget < 0:  # else a small file could ask for as much memory as it likes
+            raise ConversionError("the parameters overlap in their storages")
+        parameters[name] = array.copy()
+    return parameters
+
+
+def _storages(stream: io.BytesIO) -> Mapping[str, Float32s]:
+    """The storages behind the object, by key."""
+    keys = unpickle(stream, {})
+    if not isinstance(keys, list) or not all(isinstance(key, str) for key in keys):
+        raise ConversionError("the list of storages is damaged")
+    rest = stream.getbuffer()[stream.tell() :]
+    storages: dict[str, Float32s] = {}
+    for key in keys:
+        count = int.from_bytes(rest[:8], "little", signed=True)
+        if len(rest) < 8 or not 0 <= 4 * count <= len(rest) - 8:
+            raise ConversionError(f"storage {key} wants {count} numbers, but the file ends before")
+        storages[key] = np.frombuffer(rest[8 : 8 + 4 * count], dtype="<f4")
+        rest = rest[8 + 4 * count :]
+    if len(rest) or len(storages) != len(keys):
+        raise ConversionError("the storages do not add up to the file")
+    return storages
+
+
+def _walk(root: object) -> Iterator[tuple[str, object]]:
+    """Names and tensor references of all parameters of a module tree, in its order."""
+    pending: list[tuple[tuple[str, ...], object]] = [((), root)]
+    visited = 0
+    while pending:
+        path, module = pending.pop()
+        visited += 1
+        if not isinstance(module, InertModule):
+            raise ConversionError(f"{'.'.join(path) or 'the object'} is not a module")
+        if len(path) > MAX_DEPTH or visited > MAX_MODULES:
+            raise ConversionError("the tree of modules is too large")
+        if _part(module, path, "_buffers"):
+            raise ConversionError(f"{'.'.join(path)} has buffers, which no network here has")
+        for name, parameter in _part(module, path, "_parameters").items():
+            if parameter is not None:
+                yield ".".join((*path, name)), parameter
+        pending.extend(((*path, name), child) for name, child in _part(module, path, "_modules").items())
+
+
+def _part(module: InertModule, path: tuple[str, ...], name: str) -> dict[str, object]:
+    part = module.state.get(name, {})
+    if not isinstance(part, dict) or not all(isinstance(key, str) for key in part):
+        raise ConversionError(f"{name} of {'.'.join(path) or 'the object'} is damaged")
+    return part
+
+
+def _tensor(name: str, reference: object, storages: Mapping[str, Float32s]) -> Float32s:
+    """A read-only view of a storage; numpy checks that shape and strides stay within it."""
+    match reference:
+        case TensorRef(
+            StorageRef(str() as key, int() as count), int() as offset, tuple() as size, tuple() as stride
+        ):
+            pass
+        case _:
+            raise ConversionError(f"{name} is not a tensor")
+    storage = storages.get(key)
+    if storage is None or len(storage) != count:
+        raise ConversionError(f"the storage of {name} is missing, or not of {count} numbers")
+    numbers = (offset, *size, *stride)
+    if len(size) != len(stride) or not all(type(n) is int and 0 <= n <= count for n in numbers):
+        raise ConversionError(f"the shape of {name} is out of bounds")
+    try:
+        return np.ndarray(
+            size, dtype="<f4", buffer=storage, offset=4 * offset, strides=tuple(4 * step for step in stride)
+        )
+    except (ValueError, TypeError) as error:
+        raise ConversionError(f"{name} reaches beyond its storage: {error}") from error

@@ -1,0 +1,45 @@
+"""Checkpoints of small numbers for tests."""
+
+import torch
+from torch import Tensor
+
+from model.cvae import CvaeNetworks
+from model.forecaster import ModelInfo, Protocol
+from model.networks.config import BlindContext, NetworkConfig
+
+
+def network() -> NetworkConfig:
+    """Vehicles only, with map and neighbours."""
+    return NetworkConfig()
+
+
+def info(
+    config: NetworkConfig | None = None,
+    name: str = "some-model",
+    version: str = "1.0.0",
+    protocol: Protocol = Protocol.CAUSAL,
+) -> ModelInfo:
+    """What fits the network."""
+    config = config or network()
+    return ModelInfo(
+        name=name,
+        version=version,
+        protocol=protocol,
+        description="For tests.",
+        agent_types=config.agent_types,
+        context_types=config.neighbor_types,
+        history_frames=5,
+        modes=config.modes,
+        uses_map=config.uses_map,
+        uses_neighbors=bool(config.neighbor_types),
+        supports_blind=config.blind is not BlindContext.NONE,
+        license="none",
+    )
+
+
+def tensors(config: NetworkConfig | None = None) -> dict[str, Tensor]:
+    """Parameters of the network, the same every time."""
+    with torch.device("meta"):
+        shapes = CvaeNetworks(config or network()).state_dict()
+    generator = torch.Generator().manual_seed(0)
+    return {name: 0.1 * torch.randn(shape.shape, generator=generator) for name, shape in shapes.items()}
