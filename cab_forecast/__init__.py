@@ -1,1 +1,72 @@
-"""The public client of a cab-forecast server."""
+"""The public client of a cab-forecast server.
+
+Names are imported on first use, so that a planner that only calls ``predict`` loads protobuf and one
+transport, and neither numpy nor Pillow.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from cab_forecast.client import AsyncClient, Client
+    from cab_forecast.demo import demo_request
+    from cab_forecast.errors import (
+        BadRequest,
+        DeadlineExceeded,
+        FieldViolation,
+        ForecastError,
+        InternalError,
+        NotFound,
+        Overloaded,
+        TooLarge,
+        Unauthenticated,
+        Unavailable,
+    )
+    from cab_forecast.forecast import Forecast, Status, forecasts
+    from cab_forecast.requests import agent, map_patch, predict_request, scene_raster
+
+__all__ = [
+    "AsyncClient",
+    "BadRequest",
+    "Client",
+    "DeadlineExceeded",
+    "FieldViolation",
+    "Forecast",
+    "ForecastError",
+    "InternalError",
+    "NotFound",
+    "Overloaded",
+    "Status",
+    "TooLarge",
+    "Unauthenticated",
+    "Unavailable",
+    "agent",
+    "demo_request",
+    "forecasts",
+    "map_patch",
+    "predict_request",
+    "scene_raster",
+]
+
+_MODULES = {
+    "AsyncClient": "client",
+    "Client": "client",
+    "demo_request": "demo",
+    "Forecast": "forecast",
+    "Status": "forecast",
+    "forecasts": "forecast",
+    "agent": "requests",
+    "map_patch": "requests",
+    "predict_request": "requests",
+    "scene_raster": "requests",
+}
+
+
+def __getattr__(name: str) -> object:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULES.get(name, 'errors')}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,0 +1,59 @@
+"""Where a server is, and which transport reaches it."""
+
+from dataclasses import dataclass
+from typing import Literal
+from urllib.parse import urlsplit
+
+DEFAULT_ENDPOINT = "grpc://127.0.0.1:50051"
+"""Where `cab-forecast serve` listens by default."""
+_DEFAULT_GRPC_PORT = 50051
+_SCHEMES = ("grpc", "grpcs", "http", "https")
+
+
+@dataclass(frozen=True)
+class Endpoint:
+    """A server's address."""
+
+    url: str
+    """As people read it, e.g. ``grpc://127.0.0.1:50051``; without credentials."""
+    transport: Literal["grpc", "rest"]
+    secure: bool
+    """Whether TLS is spoken."""
+    target: str
+    """``host:port`` for gRPC; the base URL, without a slash at its end, for REST."""
+
+
+def parse_endpoint(endpoint: str) -> Endpoint:
+    """Reads ``grpc://host:port``, ``grpcs://``, ``http://``, ``https://``; bare ``host:port`` is gRPC.
+
+    The port may be left out: 50051 for gRPC, the scheme's own for HTTP. An HTTP URL may have a path, in
+    front of which a gateway serves the REST interface.
+
+    Raises:
+        ValueError: another scheme, no host, a bad port, or parts that an endpoint cannot have.
+    """
+    address = endpoint if "://" in endpoint else f"grpc://{endpoint}"
+    parts = urlsplit(address)
+    if parts.scheme not in _SCHEMES:
+        expected = ", ".join(f"{scheme}://" for scheme in _SCHEMES)
+        raise ValueError(
+            f"endpoint {endpoint!r}: unknown scheme {parts.scheme!r}, expected one of {expected}"
+        )
+    try:
+        host, port = parts.hostname, parts.port
+    except ValueError as error:
+        raise ValueError(f"endpoint {endpoint!r}: {error}") from error
+    if not host:
+        raise ValueError(f"endpoint {endpoint!r}: no host")
+    if parts.username is not None or parts.query or parts.fragment:
+        raise ValueError(f"endpoint {endpoint!r}: only scheme, host, port and, for HTTP, a path are allowed")
+    if ":" in host:  # IPv6 keeps its brackets
+        host = f"[{host}]"
+    path = parts.path.rstrip("/")
+    if parts.scheme in ("grpc", "grpcs"):
+        if path:
+            raise ValueError(f"endpoint {endpoint!r}: a gRPC endpoint has no path")
+        target = f"{host}:{port or _DEFAULT_GRPC_PORT}"
+        return Endpoint(f"{parts.scheme}://{target}", "grpc", parts.scheme == "grpcs", target)
+    url = f"{parts.scheme}://{host}{f':{port}' if port else ''}{path}"
+    return Endpoint(url, "rest", parts.scheme == "https", url)

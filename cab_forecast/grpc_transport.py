@@ -1,0 +1,131 @@
+"""Calls over gRPC."""
+
+from collections.abc import Sequence
+
+import grpc
+from google.protobuf.any_pb2 import Any
+from google.protobuf.message import Message
+from google.rpc.error_details_pb2 import BadRequest, ErrorInfo, RetryInfo
+from grpc import aio
+from grpc_status import rpc_status
+
+from cab_forecast.endpoints import Endpoint
+from cab_forecast.errors import TOO_LARGE, UNREACHABLE, FieldViolation, ForecastError, error_for
+from cab_forecast.methods import Method, Request, Response
+from cab_forecast.timing import Budget
+from cab_forecast.transport import Connection
+
+_OPTIONS: Sequence[tuple[str, int]] = (
+    # Hundreds of agents with samples pass the 4 MiB that gRPC allows by default; the server has limits.
+    ("grpc.max_receive_message_length", -1),
+    # The client retries by itself, with the server's word on when.
+    ("grpc.enable_retries", 0),
+    # A channel whose server went away looks for it again as quickly as the client's retries do.
+    ("grpc.initial_reconnect_backoff_ms", 100),
+    ("grpc.min_reconnect_backoff_ms", 100),
+    ("grpc.max_reconnect_backoff_ms", 2000),
+)
+
+
+class GrpcTransport:
+    """Blocking calls over one channel; usable from several threads."""
+
+    def __init__(self, connection: Connection) -> None:
+        endpoint = connection.endpoint
+        self._endpoint = endpoint
+        self._metadata = _metadata(connection)
+        self._channel = (
+            grpc.secure_channel(endpoint.target, _credentials(connection), _OPTIONS)
+            if endpoint.secure
+            else grpc.insecure_channel(endpoint.target, _OPTIONS)
+        )
+
+    def call(self, method: Method[Request, Response], request: Request, budget: Budget) -> Response:
+        """As ``Transport.call``."""
+        invoke = self._channel.unary_unary(method.rpc, _serialize, method.response.FromString)
+        try:
+            answer: Response = invoke(request, timeout=budget.remaining(), metadata=self._metadata)
+        except grpc.RpcError as error:
+            raise error_from_call(error, self._endpoint) from error
+        return answer
+
+    def close(self) -> None:
+        """As ``Transport.close``."""
+        self._channel.close()
+
+
+class AsyncGrpcTransport:
+    """Calls over one channel, for asyncio; made and used in one event loop."""
+
+    def __init__(self, connection: Connection) -> None:
+        endpoint = connection.endpoint
+        self._endpoint = endpoint
+        self._metadata = _metadata(connection)
+        self._channel = (
+            aio.secure_channel(endpoint.target, _credentials(connection), _OPTIONS)
+            if endpoint.secure
+            else aio.insecure_channel(endpoint.target, _OPTIONS)
+        )
+
+    async def call(self, method: Method[Request, Response], request: Request, budget: Budget) -> Response:
+        """As ``AsyncTransport.call``."""
+        invoke = self._channel.unary_unary(method.rpc, _serialize, method.response.FromString)
+        try:
+            answer: Response = await invoke(request, timeout=budget.remaining(), metadata=self._metadata)
+        except aio.AioRpcError as error:
+            raise error_from_call(error, self._endpoint) from error
+        return answer
+
+    async def close(self) -> None:
+        """As ``AsyncTransport.close``."""
+        await self._channel.close(None)
+
+
+def error_from_call(call: grpc.RpcError, endpoint: Endpoint) -> ForecastError:
+    """The exception for a failed call, from its status and the google.rpc details in its trailers.
+
+    Args:
+        call: what gRPC raised; it is the ended call as well.
+        endpoint: named when the server could not be reached.
+    """
+    code, message = call.code().name, call.details() or ""
+    reason, retry_after = "", None
+    violations: list[FieldViolation] = []
+    info, bad, retry = ErrorInfo(), BadRequest(), RetryInfo()
+    details = _details(call)
+    for detail in details:
+        if detail.Unpack(info):
+            reason = info.reason
+        elif detail.Unpack(bad):
+            violations += [FieldViolation(v.field, v.description) for v in bad.field_violations]
+        elif detail.Unpack(retry):
+            retry_after = retry.retry_delay.ToNanoseconds() / 1e9
+    if not details and code == "UNAVAILABLE":
+        # The server's own UNAVAILABLE has details; this one is the channel's.
+        message, reason = f"no connection to {endpoint.url}: {message}", UNREACHABLE
+    elif not details and code == "RESOURCE_EXHAUSTED" and "larger than max" in message:
+        # gRPC's own limit refuses a message before the server's code sees it.
+        reason = TOO_LARGE
+    return error_for(
+        code, message or code, reason=reason, field_violations=violations, retry_after=retry_after
+    )
+
+
+def _details(call: grpc.RpcError) -> Sequence[Any]:
+    try:
+        status = rpc_status.from_call(call)  # type: ignore[arg-type] # what is raised is the call
+    except ValueError:  # details that contradict the status: the status is what counts
+        return ()
+    return status.details if status else ()
+
+
+def _metadata(connection: Connection) -> tuple[tuple[str, str], ...]:
+    return (("authorization", f"Bearer {connection.token}"),) if connection.token else ()
+
+
+def _credentials(connection: Connection) -> grpc.ChannelCredentials:
+    return grpc.ssl_channel_credentials(connection.ca_file.read_bytes() if connection.ca_file else None)
+
+
+def _serialize(message: Message) -> bytes:
+    return message.SerializeToString()

@@ -1,0 +1,80 @@
+"""The map's three binary layers, to and from the bytes of the contract."""
+
+import io
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from cab.forecast.v1.prediction_service_pb2 import LayerImage
+from PIL import Image
+
+Layers = npt.NDArray[np.bool_]
+ImageEncoding = Literal["packed_bits", "png"]
+
+LAYER_NAMES = ("driveable area", "road dividers", "lane dividers")
+_COUNT = len(LAYER_NAMES)
+_PNG_ONE = 255
+_PNG_THRESHOLD = 128
+
+
+def as_layers(layers: npt.ArrayLike) -> Layers:
+    """Checks and converts map layers.
+
+    Args:
+        layers: [3, rows, columns], booleans or numbers of which only 0 and 1 occur.
+
+    Raises:
+        ValueError: another shape, or other values.
+    """
+    array: npt.NDArray[Any] = np.asarray(layers)
+    if array.ndim != _COUNT or array.shape[0] != _COUNT or 0 in array.shape:
+        raise ValueError(f"layers must be [{_COUNT}, rows, columns], but are {list(array.shape)}")
+    if array.dtype != np.bool_ and not np.isin(array, (0, 1)).all():
+        raise ValueError("layers must be binary: booleans, or zeros and ones")
+    return array.astype(np.bool_)
+
+
+def encode_layers(layers: npt.ArrayLike, encoding: ImageEncoding = "packed_bits") -> LayerImage:
+    """Map layers as the contract's bytes.
+
+    Args:
+        layers: [3, rows, columns], binary.
+        encoding: ``packed_bits`` is quick to read; ``png`` is many times smaller.
+
+    Raises:
+        ValueError: layers of another shape, or an unknown encoding.
+    """
+    array = as_layers(layers)
+    if encoding == "packed_bits":
+        return LayerImage(packed_bits=np.packbits(array).tobytes())
+    if encoding == "png":
+        pixels = np.moveaxis(array, 0, -1).astype(np.uint8) * _PNG_ONE
+        file = io.BytesIO()
+        Image.fromarray(np.ascontiguousarray(pixels)).save(file, format="PNG", optimize=True)
+        return LayerImage(png=file.getvalue())
+    raise ValueError(f"encoding must be 'packed_bits' or 'png', not {encoding!r}")
+
+
+def decode_layers(image: LayerImage, rows: int, columns: int) -> Layers:
+    """The layers in the contract's bytes: [3, rows, columns].
+
+    Args:
+        image: packed bits, or PNG.
+        rows: needed with packed bits; with a PNG 0 means whatever it has.
+        columns: likewise.
+
+    Raises:
+        ValueError: no image, or one of another size.
+    """
+    if image.WhichOneof("encoding") == "png":
+        pixels = np.asarray(Image.open(io.BytesIO(image.png)).convert("RGB"))
+        if (rows or pixels.shape[0], columns or pixels.shape[1]) != pixels.shape[:2]:
+            raise ValueError(
+                f"the PNG has {pixels.shape[0]} × {pixels.shape[1]} pixels, not {rows} × {columns}"
+            )
+        return np.moveaxis(pixels, -1, 0) >= _PNG_THRESHOLD
+    bits = _COUNT * rows * columns
+    if not bits or len(image.packed_bits) != -(-bits // 8):
+        raise ValueError(f"{len(image.packed_bits)} bytes cannot be {_COUNT} × {rows} × {columns} bits")
+    packed = np.frombuffer(image.packed_bits, dtype=np.uint8)
+    return np.unpackbits(packed, count=bits).reshape(_COUNT, rows, columns).astype(np.bool_)

@@ -1,0 +1,198 @@
+"""Requests from numpy arrays and plain Python.
+
+The builders look at shapes, which only they can see; values are the server's to judge, with one voice
+for every client.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Literal, get_args
+
+import numpy as np
+import numpy.typing as npt
+from cab.forecast.v1.model_service_pb2 import AgentType
+from cab.forecast.v1.prediction_service_pb2 import (
+    CONTEXT_BLIND,
+    CONTEXT_FULL,
+    Agent,
+    AgentState,
+    MapPatch,
+    PredictOptions,
+    PredictRequest,
+    SceneRaster,
+)
+
+from cab_forecast.layers import ImageEncoding, as_layers, encode_layers
+
+TypeName = Literal["vehicle", "pedestrian", "cyclist", "unknown"]
+
+PATCH_PIXELS = 100
+"""Rows and columns of an agent's own map patch."""
+PIXELS_PER_METER = 3.0
+"""Resolution of a patch; a raster of the same loses nothing when the server cuts patches from it."""
+
+_Floats = npt.NDArray[np.float64]
+
+
+def agent(
+    agent_id: str,
+    agent_type: TypeName,
+    times: npt.ArrayLike,
+    positions: npt.ArrayLike,
+    *,
+    headings: npt.ArrayLike | None = None,
+    velocities: npt.ArrayLike | None = None,
+    accelerations: npt.ArrayLike | None = None,
+    heading_rates: npt.ArrayLike | None = None,
+    predict: bool = True,
+    patch: MapPatch | None = None,
+) -> Agent:
+    """An agent and its history, F observations, oldest first.
+
+    In the optional arrays NaN means: not observed at that time.
+
+    Args:
+        agent_id: unique within the request.
+        agent_type: what kind of road user it is.
+        times: [F], s since the epoch, ascending.
+        positions: [F, 2], m, ground frame.
+        headings: [F], rad counter-clockwise from the ground frame's x axis.
+        velocities: [F, 2], m/s, ground frame.
+        accelerations: [F, 2], m/s², ground frame.
+        heading_rates: [F], rad/s.
+        predict: False makes it a neighbour for the others, without a forecast of its own.
+        patch: its own map, see ``map_patch``; goes before the scene's raster.
+
+    Raises:
+        ValueError: an unknown type, or arrays whose shapes do not fit each other.
+    """
+    stamps = np.atleast_1d(np.asarray(times, dtype=np.float64))
+    if stamps.ndim != 1:
+        raise ValueError(f"agent {agent_id!r}: times must be [F], but are {list(stamps.shape)}")
+    count = len(stamps)
+    columns: dict[str, _Floats] = {"time": stamps}
+    for name, values, fields in (
+        ("positions", positions, ("x", "y")),
+        ("headings", headings, ("heading",)),
+        ("velocities", velocities, ("velocity_x", "velocity_y")),
+        ("accelerations", accelerations, ("acceleration_x", "acceleration_y")),
+        ("heading_rates", heading_rates, ("heading_rate",)),
+    ):
+        if values is not None:
+            columns |= _columns(f"agent {agent_id!r}: {name}", values, count, fields)
+    required = ("time", "x", "y")
+    states = [
+        AgentState(**{k: v for k, v in zip(columns, row, strict=True) if k in required or not math.isnan(v)})
+        for row in zip(*(column.tolist() for column in columns.values()), strict=True)
+    ]
+    return Agent(id=agent_id, type=_type_number(agent_type), states=states, predict=predict, map_patch=patch)
+
+
+def scene_raster(
+    layers: npt.ArrayLike,
+    origin: Sequence[float],
+    pixels_per_meter: float = PIXELS_PER_METER,
+    encoding: ImageEncoding = "packed_bits",
+) -> SceneRaster:
+    """The map of a whole scene; the server cuts each agent's view from it.
+
+    Args:
+        layers: [3, rows, columns], binary: driveable area, road dividers, lane dividers. Element
+            [layer, i, j] shows the ground point ``origin + (i, j) / pixels_per_meter``: rows run along x.
+        origin: ground position of element [·, 0, 0], m.
+        pixels_per_meter: resolution.
+        encoding: ``packed_bits``, or ``png``, which is smaller and takes longer.
+
+    Raises:
+        ValueError: layers that are not binary or not [3, rows, columns], or an unknown encoding.
+    """
+    array = as_layers(layers)
+    origin_x, origin_y = origin
+    return SceneRaster(
+        image=encode_layers(array, encoding),
+        rows=array.shape[1],
+        columns=array.shape[2],
+        origin_x=origin_x,
+        origin_y=origin_y,
+        pixels_per_meter=pixels_per_meter,
+    )
+
+
+def map_patch(layers: npt.ArrayLike, encoding: ImageEncoding = "packed_bits") -> MapPatch:
+    """The map in one agent's frame.
+
+    Args:
+        layers: [3, 100, 100], binary: driveable area, road dividers, lane dividers. Element [layer, i, j]
+            shows the point (i − 10)/3 m ahead of the agent and (j − 50)/3 m to its left.
+        encoding: as in ``scene_raster``.
+
+    Raises:
+        ValueError: layers that are not binary or not [3, 100, 100], or an unknown encoding.
+    """
+    array = as_layers(layers)
+    if array.shape[1:] != (PATCH_PIXELS, PATCH_PIXELS):
+        raise ValueError(f"a patch must be [3, {PATCH_PIXELS}, {PATCH_PIXELS}], but is {list(array.shape)}")
+    return MapPatch(image=encode_layers(array, encoding))
+
+
+def predict_request(
+    time: float,
+    agents: Iterable[Agent],
+    *,
+    scene_id: str = "",
+    model: str = "",
+    raster: SceneRaster | None = None,
+    max_modes: int = 0,
+    samples: int = 0,
+    seed: int | None = None,
+    horizon: float | None = None,
+    blind: bool = False,
+    strict: bool = False,
+) -> PredictRequest:
+    """A request for one scene at one time.
+
+    Args:
+        time: the present, s since the epoch.
+        agents: see ``agent``.
+        scene_id: names the scene for a server that remembers agents.
+        model: ``name`` or ``name@version``; empty: the server's default.
+        raster: see ``scene_raster``.
+        max_modes: return so many of the likeliest modes only; 0: all.
+        samples: trajectories to draw for each agent.
+        seed: of the samples; None: the server draws one and returns it.
+        horizon: s, a multiple of 0.5; None: the model's.
+        blind: forecast each agent from its own history alone, without map and neighbours.
+        strict: let any agent's fault fail the whole call.
+
+    Raises:
+        ValueError: a count or seed that is negative or beyond 32 bits.
+    """
+    return PredictRequest(
+        time=time,
+        agents=agents,
+        scene_id=scene_id,
+        model=model,
+        scene_raster=raster,
+        options=PredictOptions(
+            max_modes=max_modes,
+            samples=samples,
+            seed=seed,
+            horizon=horizon,
+            context=CONTEXT_BLIND if blind else CONTEXT_FULL,
+            strict=strict,
+        ),
+    )
+
+
+def _columns(what: str, values: npt.ArrayLike, count: int, fields: Sequence[str]) -> dict[str, _Floats]:
+    array = np.asarray(values, dtype=np.float64)
+    shape = (count,) if len(fields) == 1 else (count, len(fields))
+    if array.shape != shape:
+        raise ValueError(f"{what} must be {list(shape)}, but are {list(array.shape)}")
+    return dict(zip(fields, array.reshape(count, len(fields)).T, strict=True))
+
+
+def _type_number(name: TypeName) -> AgentType.ValueType:
+    if name not in get_args(TypeName):
+        raise ValueError(f"agent type must be one of {', '.join(get_args(TypeName))}, not {name!r}")
+    return AgentType.Value(f"AGENT_TYPE_{name.upper()}")

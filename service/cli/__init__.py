@@ -1,0 +1,1 @@
+"""The command line ``cab-forecast``: one module a command."""

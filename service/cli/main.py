@@ -1,0 +1,35 @@
+"""``cab-forecast``: its commands, and nothing heavy before one of them runs."""
+
+from importlib.metadata import version
+from typing import Annotated
+
+import typer
+
+from service.cli import convert, predict, serve
+
+app = typer.Typer(
+    name="cab-forecast",
+    help="Motion forecasting as a service: Gaussian-mixture forecasts of road users.",
+    no_args_is_help=True,
+    pretty_exceptions_show_locals=False,  # locals may hold tokens
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"cab-forecast {version('cab-forecast')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    _version: Annotated[
+        bool, typer.Option("--version", help="Print the version.", callback=_print_version, is_eager=True)
+    ] = False,
+) -> None:
+    """Options of the whole program."""
+
+
+serve.register(app)
+predict.register(app)
+convert.register(app)

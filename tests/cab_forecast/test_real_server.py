@@ -1,0 +1,119 @@
+"""The client against the real server, on free ports."""
+
+import asyncio
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import SecretStr
+
+from cab_forecast import (
+    AsyncClient,
+    BadRequest,
+    Client,
+    NotFound,
+    Status,
+    Unauthenticated,
+    demo_request,
+    forecasts,
+)
+from service.server import Server
+from service.settings import Settings
+
+TOKEN = "a-token"  # noqa: S105
+MODEL = "constant-velocity-yaw"
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Server]:
+    """The server with its baselines, in a loop and thread of its own: blocking clients call it."""
+    settings = Settings(
+        http="127.0.0.1:0",
+        grpc="127.0.0.1:0",
+        default_model=MODEL,
+        max_batch_agents=32,
+        api_tokens=(SecretStr(TOKEN),),
+    )
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever)
+    thread.start()
+
+    async def start() -> Server:
+        started = Server(settings)
+        await started.start()
+        return started
+
+    try:
+        running = asyncio.run_coroutine_threadsafe(start(), loop).result(120)
+        yield running
+        asyncio.run_coroutine_threadsafe(running.stop(), loop).result(30)
+    finally:
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join()
+        loop.close()
+
+
+@pytest.fixture(params=["grpc", "http", "http-json"])
+def arguments(request: pytest.FixtureRequest, server: Server) -> dict[str, Any]:
+    """Arguments of a client that reaches it."""
+    if request.param == "grpc":
+        return {"endpoint": f"grpc://{server.grpc_address}", "token": TOKEN}
+    encoding = "json" if request.param == "http-json" else "protobuf"
+    return {"endpoint": f"http://{server.http_address}", "token": TOKEN, "encoding": encoding}
+
+
+def test_forecasts_the_demo(arguments: dict[str, Any]) -> None:
+    request = demo_request()
+    with Client(**arguments) as client:
+        response = client.predict(request)
+    views = forecasts(response)
+    assert response.model.name == MODEL
+    assert list(views) == [agent.id for agent in request.agents]
+    for view in views.values():
+        assert view.status in (Status.OK, Status.SHORT_HISTORY)
+        assert view.weights.sum() + view.remaining_weight == pytest.approx(1.0)
+        assert (np.linalg.eigvalsh(view.covariances) > 0).all()
+    np.testing.assert_allclose(views["car-straight"].most_likely[-1], [67.0, -5.25], atol=0.5)
+
+
+def test_samples_are_repeatable(arguments: dict[str, Any]) -> None:
+    request = demo_request()
+    request.options.samples, request.options.seed = 4, 11
+    with Client(**arguments) as client:
+        first, second = (forecasts(client.predict(request)) for _ in range(2))
+    assert first["cyclist"].samples.shape == (4, 12, 2)
+    np.testing.assert_array_equal(first["cyclist"].samples, second["cyclist"].samples)
+
+
+async def test_asyncio(arguments: dict[str, Any]) -> None:
+    async with AsyncClient(**arguments) as client:
+        responses = await asyncio.gather(*(client.predict(demo_request()) for _ in range(4)))
+    assert len({forecasts(response)["cyclist"].most_likely.tobytes() for response in responses}) == 1
+
+
+def test_models(arguments: dict[str, Any]) -> None:
+    with Client(**arguments) as client:
+        models = client.list_models()
+        assert {model.name for model in models} >= {MODEL, "kalman"}
+        assert [model.name for model in models if model.is_default] == [MODEL]
+        for model in models:
+            assert client.get_model(f"{model.name}@{model.version}") == model
+        with pytest.raises(NotFound) as caught:
+            client.get_model("crystal-ball")
+    assert caught.value.reason == "UNKNOWN_MODEL"
+
+
+def test_a_bad_field_is_named(arguments: dict[str, Any]) -> None:
+    request = demo_request()
+    request.ClearField("time")
+    with Client(**arguments) as client, pytest.raises(BadRequest) as caught:
+        client.predict(request)
+    assert caught.value.reason == "BAD_FIELD"
+    assert caught.value.field_violations[0].field == "time"
+
+
+def test_a_wrong_token(arguments: dict[str, Any]) -> None:
+    with Client(**{**arguments, "token": "guess"}) as client, pytest.raises(Unauthenticated):
+        client.list_models()

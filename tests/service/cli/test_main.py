@@ -1,0 +1,29 @@
+"""The program as a whole."""
+
+import subprocess
+import sys
+
+from typer.testing import CliRunner
+
+from service.cli.main import app
+
+
+def test_version() -> None:
+    result = CliRunner().invoke(app, ["--version"])
+    assert result.exit_code == 0
+    assert result.stdout.startswith("cab-forecast 0.")
+
+
+def test_help_names_the_commands_and_loads_nothing_heavy() -> None:
+    code = (
+        "import sys\n"
+        "from service.cli.main import app\n"
+        "try: app(['--help'])\n"
+        "except SystemExit: pass\n"
+        "print('LOADED', *{m.partition('.')[0] for m in sys.modules})"
+    )
+    run = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)  # noqa: S603
+    text, _, loaded = run.stdout.partition("LOADED")
+    for command in ("serve", "predict", "convert"):
+        assert command in text
+    assert not {"torch", "numpy", "matplotlib", "grpc", "httpx", "fastapi", "model"} & set(loaded.split())
