@@ -1,0 +1,1 @@
+"""What the server does with a call, whatever transport it came by."""

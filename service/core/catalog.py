@@ -1,0 +1,119 @@
+"""The loaded models as the service uses them: the default, the fallback, all by name."""
+
+from dataclasses import dataclass
+from typing import Protocol as Interface
+
+import structlog
+
+from cab.forecast.v1 import model_service_pb2 as pb
+from model.forecaster import Forecaster, ModelInfo, Protocol
+from model.registry import UnknownModelError
+from model.scene import STEP_SECONDS, AgentType
+from service.errors import UnknownModel
+from service.settings import FALLBACK_MODEL, SettingsError
+
+_log = structlog.get_logger(__name__)
+
+_PREFERRED = "cab"
+_ELSE = "kalman"
+_MAX_NAME = 128
+
+PROTOCOLS = {Protocol.CAUSAL: pb.INPUT_PROTOCOL_CAUSAL, Protocol.PAPER: pb.INPUT_PROTOCOL_PAPER}
+TYPE_NUMBERS = {
+    AgentType.VEHICLE: pb.AGENT_TYPE_VEHICLE,
+    AgentType.PEDESTRIAN: pb.AGENT_TYPE_PEDESTRIAN,
+    AgentType.CYCLIST: pb.AGENT_TYPE_CYCLIST,
+    AgentType.UNKNOWN: pb.AGENT_TYPE_UNKNOWN,
+}
+
+
+class Models(Interface):
+    """What the service needs of a registry (``model.registry.Registry``)."""
+
+    def get(self, name: str) -> Forecaster:
+        """By "name" or "name@version"; raises ``UnknownModelError``."""
+
+    def infos(self) -> list[ModelInfo]:
+        """All, sorted by name, then version."""
+
+
+@dataclass(frozen=True)
+class Catalog:
+    """Models, the default among them, and the one that everything falls back to."""
+
+    models: Models
+    default: Forecaster
+    fallback: Forecaster
+
+    def get(self, name: str) -> Forecaster:
+        """A model by "name" or "name@version"; the default for the empty name.
+
+        Raises:
+            UnknownModel: it is not loaded.
+        """
+        if not name:
+            return self.default
+        if len(name) > _MAX_NAME:
+            raise UnknownModel(f"no model has a name of {len(name)} characters")
+        try:
+            return self.models.get(name)
+        except UnknownModelError as error:
+            raise UnknownModel(str(error)) from error
+
+    def describe(self, info: ModelInfo) -> pb.Model:
+        """The contract's message on a model."""
+        return pb.Model(
+            name=info.name,
+            version=info.version,
+            protocol=PROTOCOLS[info.protocol],
+            is_default=info == self.default.info,
+            description=info.description,
+            agent_types=[TYPE_NUMBERS[kind] for kind in info.agent_types],
+            context_types=[TYPE_NUMBERS[kind] for kind in info.context_types],
+            horizon=info.horizon,
+            step=STEP_SECONDS,
+            history_frames=info.history_frames,
+            modes=info.modes,
+            uses_map=info.uses_map,
+            uses_neighbors=info.uses_neighbors,
+            trained_on=info.trained_on,
+            benchmark=info.benchmark,
+            license=info.license,
+            supports_blind=info.supports_blind,
+        )
+
+
+def reference(info: ModelInfo) -> pb.ModelReference:
+    """Which model made a forecast."""
+    return pb.ModelReference(name=info.name, version=info.version, protocol=PROTOCOLS[info.protocol])
+
+
+def build_catalog(models: Models, default: str | None) -> Catalog:
+    """Chooses default and fallback, and says which and why.
+
+    Args:
+        models: what was loaded.
+        default: the one that was asked for; None: "cab" if loaded, else "kalman".
+
+    Raises:
+        SettingsError: a model that is needed is not there, or the fallback forecasts less far than another.
+    """
+    names = {info.name for info in models.infos()}
+    if default is not None:
+        name, why = default, "it was asked for"
+    elif _PREFERRED in names:
+        name, why = _PREFERRED, "it is loaded"
+    else:
+        name, why = _ELSE, f"{_PREFERRED} is not loaded"
+    try:
+        catalog = Catalog(models, models.get(name), models.get(FALLBACK_MODEL))
+    except UnknownModelError as error:
+        raise SettingsError(f"default_model: {error}") from error
+    for info in models.infos():
+        if info.steps > catalog.fallback.info.steps:
+            raise SettingsError(
+                f"models: {info.name} forecasts further than {FALLBACK_MODEL}, which must stand in"
+            )
+    info = catalog.default.info
+    _log.info("default model", name=info.name, version=info.version, why=why)
+    return catalog

@@ -1,0 +1,250 @@
+"""A call from request message to answer message; the transports only carry them."""
+
+import asyncio
+import os
+import secrets
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from enum import StrEnum
+from typing import TypeVar
+
+import numpy as np
+import structlog
+import torch
+
+from cab.forecast.v1 import model_service_pb2 as models_pb
+from cab.forecast.v1 import prediction_service_pb2 as pb
+from service.core.batcher import Admission, Batcher, Outcome
+from service.core.catalog import Catalog, Models, build_catalog
+from service.core.encode import Result, encode, finite
+from service.core.options import read_options
+from service.core.plan import Draft, Group, Plan, check_strict, fall_back, make_plan
+from service.core.warmup import warm_up
+from service.errors import BadField, DeadlineExceeded, Fault, Unavailable
+from service.settings import Settings
+from service.telemetry.metrics import Metrics
+
+_log = structlog.get_logger(__name__)
+
+_T = TypeVar("_T")
+_MAX_WORKERS = 8
+
+
+class Phase(StrEnum):
+    """Where a server is in its life."""
+
+    STARTING = "starting"
+    READY = "ready"
+    DRAINING = "draining"
+
+
+class DataPlane:
+    """The service itself. Lives on one event loop; decoding, encoding and the model have threads."""
+
+    def __init__(self, settings: Settings, metrics: Metrics) -> None:
+        self._settings = settings
+        self._metrics = metrics
+        self._catalog: Catalog | None = None
+        self._batcher = Batcher(
+            settings.max_batch_agents, settings.max_queue_agents, metrics, threads=settings.threads
+        )
+        self._threads = ThreadPoolExecutor(
+            min(_MAX_WORKERS, (os.cpu_count() or 1) + 1), thread_name_prefix="calls"
+        )
+        self._phase = Phase.STARTING
+        self._calls = 0
+        self._idle = asyncio.Event()
+        self._idle.set()
+
+    @property
+    def phase(self) -> Phase:
+        """Where this server is in its life."""
+        return self._phase
+
+    async def open(self, load: Callable[[], Models]) -> None:
+        """Loads and warms up; calls are taken from then on.
+
+        Args:
+            load: gives the models; runs in a thread.
+
+        Raises:
+            SettingsError: a model that is needed is not there.
+            Exception: whatever ``load`` raises.
+        """
+        models = await self._in_thread(load)
+        catalog = build_catalog(models, self._settings.default_model)
+        self._batcher.start()
+        await warm_up(self._batcher, catalog, self._settings.max_batch_agents)
+        self._metrics.set_models(models.infos(), catalog.default.info)
+        self._catalog = catalog
+        if self._phase is Phase.STARTING:  # a signal may have come meanwhile
+            self._phase = Phase.READY
+
+    def refuse(self) -> None:
+        """No more calls; those accepted go on."""
+        self._phase = Phase.DRAINING
+
+    async def drain(self, seconds: float) -> bool:
+        """Waits for the accepted calls, so long at most; whether all were answered."""
+        self.refuse()
+        try:
+            async with asyncio.timeout(seconds):
+                await self._idle.wait()
+        except TimeoutError:
+            _log.warning("calls left unanswered", calls=self._calls)
+        return self._calls == 0
+
+    async def close(self) -> None:
+        """Stops the threads."""
+        self.refuse()
+        await self._batcher.stop()
+        await asyncio.to_thread(self._threads.shutdown, cancel_futures=True)
+
+    def check(self) -> None:
+        """Whether a forecast could be accepted now: to be asked before work goes into reading a request.
+
+        Raises:
+            Unavailable: not ready.
+            Overloaded: the queue is full.
+        """
+        self._accept()
+        self._batcher.check()
+
+    async def predict(self, request: pb.PredictRequest, deadline: float | None = None) -> pb.PredictResponse:
+        """Forecasts the agents of a scene. Cancelling the call takes it out of the queue.
+
+        Args:
+            request: as it came.
+            deadline: on the event loop's clock (s); the server's own limit holds as well.
+
+        Raises:
+            ServiceError: whatever row of the table applies.
+        """
+        catalog = self._accept()
+        limit = asyncio.get_running_loop().time() + self._settings.max_timeout
+        deadline = limit if deadline is None else min(deadline, limit)
+        with self._counted():
+            timeout = asyncio.timeout_at(deadline)
+            try:
+                async with timeout:
+                    return await self._predict(request, catalog, deadline)
+            except TimeoutError:
+                if not timeout.expired():
+                    raise
+                raise DeadlineExceeded("the deadline passed before a forecast was made") from None
+
+    async def list_models(self, request: models_pb.ListModelsRequest) -> models_pb.ListModelsResponse:
+        """All models.
+
+        Raises:
+            Unavailable: not ready.
+        """
+        catalog = self._accept()
+        return models_pb.ListModelsResponse(
+            models=[catalog.describe(info) for info in catalog.models.infos()]
+        )
+
+    async def get_model(self, request: models_pb.GetModelRequest) -> models_pb.GetModelResponse:
+        """One model.
+
+        Raises:
+            BadField: no name.
+            UnknownModel: not loaded.
+            Unavailable: not ready.
+        """
+        catalog = self._accept()
+        if not request.name:
+            raise BadField("name", "is required")
+        return models_pb.GetModelResponse(model=catalog.describe(catalog.get(request.name).info))
+
+    async def _predict(
+        self, request: pb.PredictRequest, catalog: Catalog, deadline: float
+    ) -> pb.PredictResponse:
+        forecaster = catalog.get(request.model)
+        options = read_options(request, forecaster.info, self._settings)
+        with self._batcher.admit(options.predicted) as admission:
+            plan = await self._in_thread(make_plan, request, options, forecaster, catalog, self._settings)
+            results, outcomes = await self._forecast(plan, deadline, admission)
+        seed = 0
+        if options.samples:
+            seed = secrets.randbits(32) if options.seed is None else options.seed
+        response = await self._in_thread(encode, plan, results, outcomes, seed)
+        self._count_agents(plan)
+        return response
+
+    async def _forecast(
+        self, plan: Plan, deadline: float, admission: Admission
+    ) -> tuple[list[Result], list[Outcome]]:
+        """Runs the plan; agents whose forecast is not finite get another one from the fallback."""
+        outcomes = await self._batcher.run([group.job for group in plan.groups], deadline, admission)
+        results, broken = _sift(plan.groups, outcomes)
+        if not broken:
+            return results, outcomes
+        self._reassign(plan, broken)
+        again = await self._in_thread(
+            plan.add_groups, [draft for draft in broken if draft.status != pb.FORECAST_STATUS_INVALID]
+        )
+        more = await self._batcher.run([group.job for group in again], deadline, admission)
+        rescued, lost = _sift(again, more)
+        self._reassign(plan, lost)
+        check_strict(plan)
+        return [*results, *rescued], [*outcomes, *more]
+
+    def _reassign(self, plan: Plan, broken: Sequence[Draft]) -> None:
+        """Hands agents on to the fallback, or gives them up if it was the fallback that failed."""
+        for draft in broken:
+            failed = draft.forecaster
+            if failed is None:
+                continue
+            self._metrics.nonfinite.labels(failed.info.name).inc()
+            why = f"the forecast of {failed.info.name} was not finite"
+            here = f"agents[{draft.index}]"
+            if failed is plan.fallback:
+                draft.invalidate(Fault(here, why))
+            else:
+                fall_back(draft, plan.fallback, here, why)
+        if broken:
+            _log.error("forecasts not finite", model=plan.forecaster.info.name, agents=len(broken))
+
+    def _count_agents(self, plan: Plan) -> None:
+        name = plan.forecaster.info.name
+        for draft in plan.drafts:
+            status = pb.ForecastStatus.Name(draft.status).removeprefix("FORECAST_STATUS_").lower()
+            self._metrics.agents.labels(name, status).inc()
+
+    def _accept(self) -> Catalog:
+        if self._catalog is None or self._phase is not Phase.READY:
+            raise Unavailable(f"the server is {self._phase.value}")
+        return self._catalog
+
+    @contextmanager
+    def _counted(self) -> Iterator[None]:
+        self._calls += 1
+        self._idle.clear()
+        try:
+            yield
+        finally:
+            self._calls -= 1
+            if self._calls == 0:
+                self._idle.set()
+
+    async def _in_thread(self, function: Callable[..., _T], *arguments: object) -> _T:
+        return await asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)
+
+
+def _sift(groups: Sequence[Group], outcomes: Sequence[Outcome]) -> tuple[list[Result], list[Draft]]:
+    """What can be sent, and the agents whose forecast cannot."""
+    results: list[Result] = []
+    broken: list[Draft] = []
+    for group, outcome in zip(groups, outcomes, strict=True):
+        good = finite(outcome.mixture)
+        if good.all():
+            results.append(Result(group.drafts, outcome.mixture))
+            continue
+        broken.extend(draft for draft, fine in zip(group.drafts, good.tolist(), strict=True) if not fine)
+        kept = np.flatnonzero(good)
+        if len(kept):
+            drafts = [group.drafts[row] for row in kept.tolist()]
+            results.append(Result(drafts, outcome.mixture[torch.from_numpy(kept)]))
+    return results, broken

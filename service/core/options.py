@@ -1,0 +1,143 @@
+"""The parts of a request that concern the call as a whole."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from cab.forecast.v1 import prediction_service_pb2 as pb
+from model.forecaster import Context, ModelInfo
+from model.scene import STEP_SECONDS, Raster
+from service.core.images import decode_layers
+from service.errors import BadField, TooLarge
+from service.settings import Settings
+
+MAX_ID_LENGTH = 128
+"""Characters of an agent's or a scene's id."""
+MAX_TIME = 1e10
+"""s since the epoch, either way."""
+MAX_POSITION = 1e7
+"""m from the origin, either way."""
+_PIXELS_PER_METER = (0.1, 100.0)
+_CONTEXTS = {
+    pb.CONTEXT_UNSPECIFIED: Context.FULL,
+    pb.CONTEXT_FULL: Context.FULL,
+    pb.CONTEXT_BLIND: Context.BLIND,
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a call wants to be answered."""
+
+    time: float
+    """The present, s."""
+    steps: int
+    context: Context
+    max_modes: int
+    """0: all."""
+    samples: int
+    seed: int | None
+    strict: bool
+    predicted: int
+    """Agents that want a forecast."""
+
+
+def read_options(request: pb.PredictRequest, info: ModelInfo, settings: Settings) -> Options:
+    """Checks everything but agents and map.
+
+    Args:
+        request: the request.
+        info: the model that it asks for.
+        settings: the limits.
+
+    Raises:
+        BadField: a field is missing or out of its range.
+        TooLarge: too many agents.
+    """
+    if len(request.agents) > settings.max_agents:
+        raise TooLarge(f"{len(request.agents)} agents; at most {settings.max_agents} are accepted")
+    if len(request.scene_id) > MAX_ID_LENGTH:
+        raise BadField("scene_id", f"has {len(request.scene_id)} characters; at most {MAX_ID_LENGTH}")
+    if not request.HasField("time"):
+        raise BadField("time", "is required")
+    _check_number("time", request.time, -MAX_TIME, MAX_TIME)
+
+    options = request.options
+    context = _CONTEXTS.get(options.context)
+    if context is None:
+        raise BadField("options.context", f"unknown value {options.context}")
+    if context is Context.BLIND and not info.supports_blind:
+        raise BadField("options.context", f"{info.name} has no blind forecast")
+    predicted = sum(not agent.HasField("predict") or agent.predict for agent in request.agents)
+    if options.samples > settings.max_samples:
+        raise BadField("options.samples", f"at most {settings.max_samples}")
+    if options.samples * predicted > settings.max_samples_per_call:
+        raise BadField(
+            "options.samples",
+            f"{options.samples} × {predicted} agents; at most {settings.max_samples_per_call} in a call",
+        )
+    return Options(
+        time=request.time,
+        steps=_steps(options, info),
+        context=context,
+        max_modes=options.max_modes,
+        samples=options.samples,
+        seed=options.seed if options.HasField("seed") else None,
+        strict=options.strict,
+        predicted=predicted,
+    )
+
+
+def read_raster(request: pb.PredictRequest, settings: Settings) -> Raster | None:
+    """The map of the whole scene, if there is one.
+
+    Raises:
+        BadField: a part of it is missing, out of its range, or does not fit the rest.
+    """
+    if not request.HasField("scene_raster"):
+        return None
+    raster = request.scene_raster
+    for name, low, high in (
+        ("origin_x", -MAX_POSITION, MAX_POSITION),
+        ("origin_y", -MAX_POSITION, MAX_POSITION),
+        ("pixels_per_meter", *_PIXELS_PER_METER),
+    ):
+        if not raster.HasField(name):  # type: ignore[arg-type]  # one of three literals
+            raise BadField(f"scene_raster.{name}", "is required")
+        _check_number(f"scene_raster.{name}", getattr(raster, name), low, high)
+    if raster.image.WhichOneof("encoding") == "packed_bits":
+        for name, size in (("rows", raster.rows), ("columns", raster.columns)):
+            if size == 0:
+                raise BadField(f"scene_raster.{name}", "is required with packed_bits")
+    if raster.rows * raster.columns > settings.max_raster_pixels:
+        raise BadField(
+            "scene_raster.rows",
+            f"{raster.rows} × {raster.columns} pixels; at most {settings.max_raster_pixels} are accepted",
+        )
+    layers = decode_layers(
+        raster.image,
+        "scene_raster.image",
+        raster.rows or None,
+        raster.columns or None,
+        settings.max_raster_pixels,
+    )
+    origin = np.array([raster.origin_x, raster.origin_y])
+    return Raster(layers=layers, origin=origin, pixels_per_meter=raster.pixels_per_meter)
+
+
+def _steps(options: pb.PredictOptions, info: ModelInfo) -> int:
+    if not options.HasField("horizon"):
+        return info.steps
+    _check_number("options.horizon", options.horizon, STEP_SECONDS, info.horizon)
+    steps = round(options.horizon / STEP_SECONDS)
+    if abs(steps * STEP_SECONDS - options.horizon) > 1e-6:
+        raise BadField("options.horizon", f"must be a multiple of {STEP_SECONDS} s")
+    return steps
+
+
+def _check_number(field: str, value: float, low: float, high: float) -> None:
+    if not math.isfinite(value):
+        raise BadField(field, "must be a finite number")
+    if not low <= value <= high:
+        raise BadField(field, f"must be within {low:g} … {high:g}")

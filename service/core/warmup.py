@@ -1,0 +1,83 @@
+"""First forwards, made before anyone waits for them: they allocate, compile and cache."""
+
+import asyncio
+import time
+
+import numpy as np
+import structlog
+import torch
+
+from model.forecaster import Context, Features, Forecaster, agent_count, join
+from model.scene import STEP_SECONDS, AgentStates, AgentType, Raster, Scene
+from service.core.batcher import Batcher, Job
+from service.core.catalog import Catalog
+
+_log = structlog.get_logger(__name__)
+
+_SCENE_AGENTS = 8
+_SPEED = 5.0
+
+
+async def warm_up(batcher: Batcher, catalog: Catalog, max_batch_agents: int) -> None:
+    """Runs every model once for each agent type, alone and in the largest batch; the default model and
+    the fallback in the sizes between as well, by powers of two.
+
+    Args:
+        batcher: whose model thread does the work.
+        catalog: the models.
+        max_batch_agents: the largest batch there will be.
+    """
+    started = time.perf_counter()
+    forwards = 0
+    for info in catalog.models.infos():
+        forecaster = catalog.get(f"{info.name}@{info.version}")
+        main = forecaster is catalog.default or forecaster is catalog.fallback
+        sizes = _sizes(max_batch_agents) if main else sorted({1, max_batch_agents})
+        for kind in info.agent_types:
+            for context in (Context.FULL, Context.BLIND) if info.supports_blind else (Context.FULL,):
+                for job in await asyncio.to_thread(_jobs, forecaster, kind, context, sizes):
+                    await batcher.run_in_model_thread(job)
+                    forwards += 1
+    _log.info("warmed up", forwards=forwards, seconds=round(time.perf_counter() - started, 3))
+
+
+def _sizes(largest: int) -> list[int]:
+    """1, 2, 4, … and the largest."""
+    sizes = [1 << power for power in range(largest.bit_length()) if 1 << power < largest]
+    return [*sizes, largest]
+
+
+def _jobs(forecaster: Forecaster, kind: AgentType, context: Context, sizes: list[int]) -> list[Job]:
+    """One job of each size."""
+    with torch.inference_mode():
+        few = forecaster.prepare(_scene(forecaster, kind), np.arange(_SCENE_AGENTS), context)
+        steps = forecaster.info.steps
+        return [Job(forecaster, kind, context, _repeat(few, size), steps) for size in sizes]
+
+
+def _repeat(features: Features, size: int) -> Features:
+    """Features of so many agents, made of those of a few."""
+    copies = -(-size // agent_count(features))
+    return {name: tensor[:size] for name, tensor in join([features] * copies).items()}
+
+
+def _scene(forecaster: Forecaster, kind: AgentType) -> Scene:
+    """Agents abreast, driving straight on, on a map that is road throughout."""
+    frames = forecaster.info.history_frames
+    age = STEP_SECONDS * np.arange(frames - 1, -1, -1.0)
+    position = np.zeros((_SCENE_AGENTS, frames, 2))
+    position[:, :, 0] = -_SPEED * age
+    position[:, :, 1] = 5.0 * np.arange(_SCENE_AGENTS)[:, None]
+    velocity = np.zeros_like(position)
+    velocity[:, :, 0] = _SPEED
+    flat = np.zeros((_SCENE_AGENTS, frames))
+    states = AgentStates(
+        position=position,
+        velocity=velocity,
+        acceleration=np.zeros_like(position),
+        heading=flat,
+        heading_rate=flat,
+        first=np.zeros(_SCENE_AGENTS, dtype=np.int64),
+    )
+    raster = Raster(np.ones((3, 200, 200), dtype=np.uint8), np.array([-30.0, -30.0]), 3.0)
+    return Scene(types=[kind] * _SCENE_AGENTS, states=states, raster=raster)

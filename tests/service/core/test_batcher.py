@@ -1,0 +1,289 @@
+"""The queue: who rides with whom, who is refused, and who leaves it."""
+
+import asyncio
+from collections.abc import AsyncIterator
+
+import pytest
+import torch
+
+from model.forecaster import Context, Features
+from model.scene import AgentType
+from service.core.batcher import Admission, Batcher, Job, Outcome
+from service.errors import DeadlineExceeded, Internal, Overloaded, Unavailable
+from service.telemetry.metrics import Metrics
+from tests.service.fakes import FakeForecaster
+
+FAR = 1e12
+VEHICLE, PEDESTRIAN = AgentType.VEHICLE, AgentType.PEDESTRIAN
+
+
+@pytest.fixture
+async def batcher() -> AsyncIterator[Batcher]:
+    """At most 8 agents in a batch and 20 in the queue."""
+    made = Batcher(8, 20, Metrics())
+    made.start()
+    yield made
+    await made.stop()
+
+
+@pytest.fixture
+def fake() -> FakeForecaster:
+    """Holds its forwards back until the test lets them go."""
+    forecaster = FakeForecaster()
+    forecaster.free.clear()
+    return forecaster
+
+
+def features(agents: int, x: float = 0.0) -> Features:
+    position = torch.zeros(agents, 2, dtype=torch.float64)
+    position[:, 0] = x + torch.arange(agents)
+    return {"position": position, "velocity": torch.ones(agents, 2, dtype=torch.float64)}
+
+
+def job(
+    fake: FakeForecaster,
+    agents: int,
+    kind: AgentType = VEHICLE,
+    context: Context = Context.FULL,
+    steps: int = 12,
+    x: float = 0.0,
+) -> Job:
+    return Job(fake, kind, context, features(agents, x), steps)
+
+
+def submit(batcher: Batcher, *jobs: Job, deadline: float = FAR) -> "asyncio.Task[list[Outcome]]":
+    async def call() -> list[Outcome]:
+        with batcher.admit(sum(each.agents for each in jobs)) as admission:
+            return await batcher.run(jobs, deadline, admission)
+
+    return asyncio.create_task(call())
+
+
+async def hold(batcher: Batcher, fake: FakeForecaster) -> "asyncio.Task[list[Outcome]]":
+    """A call that keeps the model busy."""
+    first = submit(batcher, job(fake, 1))
+    assert await asyncio.to_thread(fake.entered.wait, 10)
+    return first
+
+
+async def settle() -> None:
+    for _ in range(5):
+        await asyncio.sleep(0)
+
+
+async def test_waiting_calls_share_a_batch(batcher: Batcher, fake: FakeForecaster) -> None:
+    first = await hold(batcher, fake)
+    second, third = submit(batcher, job(fake, 2, x=100.0)), submit(batcher, job(fake, 3, x=200.0))
+    await settle()
+    assert batcher.waiting == 5
+    fake.free.set()
+    await first
+    [two], [three] = await second, await third
+    assert [agents for _, agents, _, _ in fake.batches] == [1, 5]
+    assert two.batch_agents == three.batch_agents == 5
+    assert two.mixture.origin[:, 0].tolist() == [100.0, 101.0]
+    assert three.mixture.origin[:, 0].tolist() == [200.0, 201.0, 202.0]
+    assert two.queue > 0
+    assert two.inference == three.inference > 0
+    assert batcher.waiting == 0
+
+
+async def test_a_lone_call_does_not_wait(batcher: Batcher, fake: FakeForecaster) -> None:
+    fake.free.set()
+    [outcome] = await submit(batcher, job(fake, 2))
+    assert outcome.batch_agents == 2
+    assert outcome.queue < 0.5
+
+
+async def test_bound_is_kept_and_nobody_overtakes(batcher: Batcher, fake: FakeForecaster) -> None:
+    first = await hold(batcher, fake)
+    calls = [submit(batcher, job(fake, agents)) for agents in (5, 4, 1, 8)]
+    await settle()
+    fake.free.set()
+    await asyncio.gather(first, *calls)
+    assert [agents for _, agents, _, _ in fake.batches] == [1, 5, 5, 8]
+
+
+async def test_unlike_calls_do_not_share(batcher: Batcher, fake: FakeForecaster) -> None:
+    first = await hold(batcher, fake)
+    other = FakeForecaster("other")
+    calls = [
+        submit(batcher, job(fake, 1)),
+        submit(batcher, job(fake, 1, kind=PEDESTRIAN)),
+        submit(batcher, job(fake, 1, context=Context.BLIND)),
+        submit(batcher, job(other, 1)),
+        submit(batcher, job(fake, 2)),
+    ]
+    await settle()
+    fake.free.set()
+    await asyncio.gather(first, *calls)
+    assert fake.batches[1:] == [
+        (VEHICLE, 3, Context.FULL, 12),
+        (PEDESTRIAN, 1, Context.FULL, 12),
+        (VEHICLE, 1, Context.BLIND, 12),
+    ]
+    assert len(other.batches) == 1
+
+
+async def test_each_gets_its_own_steps(batcher: Batcher, fake: FakeForecaster) -> None:
+    first = await hold(batcher, fake)
+    short, long = submit(batcher, job(fake, 1, steps=2)), submit(batcher, job(fake, 1, steps=7))
+    await settle()
+    fake.free.set()
+    await first
+    assert (await short)[0].mixture.means.shape[2] == 2
+    assert (await long)[0].mixture.covariances.shape[2] == 7
+    assert fake.batches[1][3] == 7
+
+
+async def test_a_large_job_is_split_and_put_together(batcher: Batcher, fake: FakeForecaster) -> None:
+    fake.free.set()
+    [outcome] = await submit(batcher, job(fake, 19))
+    assert [agents for _, agents, _, _ in fake.batches] == [8, 8, 3]
+    assert outcome.mixture.origin[:, 0].tolist() == list(range(19))
+    assert outcome.batch_agents == 8
+
+
+async def test_jobs_of_one_call_come_back_in_order(batcher: Batcher, fake: FakeForecaster) -> None:
+    fake.free.set()
+    outcomes = await submit(batcher, job(fake, 2, x=10.0), job(fake, 1, kind=PEDESTRIAN, x=20.0))
+    assert [outcome.mixture.origin[0, 0].item() for outcome in outcomes] == [10.0, 20.0]
+
+
+async def test_a_full_queue_refuses(batcher: Batcher, fake: FakeForecaster) -> None:
+    first = await hold(batcher, fake)
+    waiting = submit(batcher, job(fake, 19))
+    await settle()
+    fits = submit(batcher, job(fake, 1))
+    await settle()
+    with pytest.raises(Overloaded) as caught:
+        await submit(batcher, job(fake, 1))
+    assert caught.value.retry_after is not None
+    fake.free.set()
+    await asyncio.gather(first, waiting, fits)
+    await submit(batcher, job(fake, 20))
+
+
+async def test_places_are_given_back_without_a_forward(batcher: Batcher) -> None:
+    with batcher.admit(15) as admission:
+        assert batcher.waiting == 15
+        assert await batcher.run([], FAR, admission) == []
+        assert batcher.waiting == 0
+    assert batcher.waiting == 0
+
+
+async def test_empty_calls_count(batcher: Batcher) -> None:
+    with batcher.admit(0):
+        assert batcher.waiting == 1
+
+
+async def test_a_late_call_never_runs(batcher: Batcher, fake: FakeForecaster) -> None:
+    first = await hold(batcher, fake)
+    late = submit(batcher, job(fake, 2), deadline=asyncio.get_running_loop().time() + 0.01)
+    await asyncio.sleep(0.02)
+    fake.free.set()
+    with pytest.raises(DeadlineExceeded):
+        await late
+    await first
+    assert len(fake.batches) == 1
+    assert batcher.waiting == 0
+
+
+async def test_a_cancelled_call_leaves_the_queue(batcher: Batcher, fake: FakeForecaster) -> None:
+    first = await hold(batcher, fake)
+    gone, stays = submit(batcher, job(fake, 2)), submit(batcher, job(fake, 3))
+    await settle()
+    gone.cancel()
+    await settle()
+    assert batcher.waiting == 3
+    fake.free.set()
+    await asyncio.gather(first, stays)
+    assert [agents for _, agents, _, _ in fake.batches] == [1, 3]
+
+
+async def test_a_call_cancelled_inside_the_model_harms_nobody(batcher: Batcher, fake: FakeForecaster) -> None:
+    first = await hold(batcher, fake)
+    first.cancel()
+    second = submit(batcher, job(fake, 2))
+    await settle()
+    fake.free.set()
+    assert len((await second)[0].mixture) == 2
+
+
+async def test_a_failure_costs_its_batch_only(batcher: Batcher, fake: FakeForecaster) -> None:
+    first = await hold(batcher, fake)
+    fake.broken = True
+    other = FakeForecaster("other")
+    second = submit(batcher, job(other, 1))
+    await settle()
+    fake.free.set()
+    with pytest.raises(Internal):
+        await first
+    assert await second
+    fake.broken = False
+    assert await submit(batcher, job(fake, 1))
+
+
+async def test_a_call_of_two_jobs_fails_as_one(batcher: Batcher, fake: FakeForecaster) -> None:
+    fake.free.set()
+    fake.broken = True
+    with pytest.raises(Internal):
+        await submit(batcher, job(fake, 1), job(fake, 1, kind=PEDESTRIAN))
+    await settle()
+    assert batcher.waiting == 0
+
+
+async def test_a_forward_of_the_wrong_size_is_a_failure(
+    batcher: Batcher, fake: FakeForecaster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fake.free.set()
+    made = fake.forecast
+    monkeypatch.setattr(fake, "forecast", lambda *arguments: made(*arguments)[:1])
+    with pytest.raises(Internal):
+        await submit(batcher, job(fake, 2))
+
+
+async def test_stop_fails_what_waits_and_finishes_what_runs(fake: FakeForecaster) -> None:
+    batcher = Batcher(8, 20, Metrics())
+    batcher.start()
+    first = await hold(batcher, fake)
+    second = submit(batcher, job(fake, 1))
+    await settle()
+    stopping = asyncio.create_task(batcher.stop())
+    await settle()
+    fake.free.set()
+    await stopping
+    for call in (first, second):
+        with pytest.raises(Unavailable):
+            await call
+
+
+async def test_a_second_forward_needs_no_place(batcher: Batcher, fake: FakeForecaster) -> None:
+    fake.free.set()
+    assert await batcher.run([job(fake, 3)], FAR, Admission(0))
+    assert batcher.waiting == 0
+
+
+async def test_warm_up_goes_past_the_queue(batcher: Batcher, fake: FakeForecaster) -> None:
+    fake.free.set()
+    await batcher.run_in_model_thread(job(fake, 30))
+    assert fake.batches == [(VEHICLE, 30, Context.FULL, 12)]
+
+
+async def test_threads_of_the_forward() -> None:
+    seen = []
+
+    class Counting(FakeForecaster):
+        def forecast(self, *arguments, **named):  # type: ignore[no-untyped-def]
+            seen.append((torch.get_num_threads(), torch.is_inference_mode_enabled()))
+            return super().forecast(*arguments, **named)
+
+    before = torch.get_num_threads()
+    batcher = Batcher(8, 20, Metrics(), threads=1)
+    batcher.start()
+    try:
+        await submit(batcher, job(Counting(), 1))
+    finally:
+        await batcher.stop()
+        torch.set_num_threads(before)
+    assert seen == [(1, True)]

@@ -1,0 +1,417 @@
+"""Whole calls without a transport: who forecasts whom, and what the answer says of it."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cab.forecast.v1 import model_service_pb2 as models_pb
+from cab.forecast.v1 import prediction_service_pb2 as pb
+from model.forecaster import Context, Protocol
+from service.core.dataplane import DataPlane, Phase
+from service.errors import BadField, BadFields, Unavailable, UnknownModel
+from service.settings import FALLBACK_MODEL, SettingsError
+from service.telemetry.metrics import Metrics
+from tests.service.fakes import FakeForecaster, registry
+from tests.service.requests import CYCLIST, NOW, PEDESTRIAN, add_agent, make_request, pack
+from tests.service.servers import settings
+
+OK = pb.FORECAST_STATUS_OK
+SHORT = pb.FORECAST_STATUS_SHORT_HISTORY
+FALLBACK = pb.FORECAST_STATUS_FALLBACK
+INVALID = pb.FORECAST_STATUS_INVALID
+
+
+@asynccontextmanager
+async def opened(*forecasters: FakeForecaster, **values: Any) -> AsyncIterator[DataPlane]:
+    """A data plane, the default of which is the first forecaster."""
+    named = {"default_model": forecasters[0].info.name} if forecasters else {}
+    plane = DataPlane(settings(**(named | values)), Metrics())
+    await plane.open(lambda: registry(*forecasters))
+    for forecaster in forecasters:
+        forecaster.forget()
+    try:
+        yield plane
+    finally:
+        await plane.close()
+
+
+async def predict(
+    request: pb.PredictRequest, *forecasters: FakeForecaster, **values: Any
+) -> pb.PredictResponse:
+    async with opened(*forecasters, **values) as plane:
+        return await plane.predict(request)
+
+
+def means(forecast: pb.AgentForecast, response: pb.PredictResponse) -> np.ndarray[Any, Any]:
+    return np.array(forecast.means).reshape(-1, response.steps, 2)
+
+
+async def test_a_plain_forecast() -> None:
+    response = await predict(make_request(2), FakeForecaster())
+    assert [forecast.agent_id for forecast in response.forecasts] == ["a0", "a1"]
+    assert (response.time, response.steps, response.step, response.seed) == (NOW, 12, 0.5, 0)
+    assert (response.model.name, response.model.version) == ("fake", "1.0.0")
+    assert response.model.protocol == models_pb.INPUT_PROTOCOL_CAUSAL
+    assert response.timing.batch_agents == 2
+    assert response.timing.inference > 0
+    assert list(response.warnings) == []
+    forecast = response.forecasts[1]
+    assert (forecast.status, forecast.detail, forecast.field) == (OK, "", "")
+    assert forecast.model == response.model
+    assert forecast.history_frames == 3
+    assert list(forecast.mode_ids) == [0, 1, 2, 3]
+    assert list(forecast.weights) == pytest.approx(np.exp([1, 2, 3, 4]) / np.exp([1, 2, 3, 4]).sum())
+    assert forecast.most_likely_mode == 3
+    assert forecast.remaining_weight == 0
+    expected = 0.5 * np.arange(1, 13)[:, None] * [5.0, 0.0] + [0.0, 4.0]
+    assert means(forecast, response)[0] == pytest.approx(expected, abs=1e-4)
+    assert np.array(forecast.covariances).reshape(4, 12, 3)[2, 3].tolist() == [2.0, 0.0, 2.0]
+
+
+async def test_modes_are_cut_in_the_models_order() -> None:
+    response = await predict(make_request(1, max_modes=2), FakeForecaster())
+    [forecast] = response.forecasts
+    assert list(forecast.mode_ids) == [2, 3]
+    assert forecast.most_likely_mode == 1
+    assert sum(forecast.weights) + forecast.remaining_weight == pytest.approx(1)
+    assert means(forecast, response).shape == (2, 12, 2)
+    assert means(forecast, response)[1, 0, 0] == pytest.approx(2.5 * 1.3)
+
+
+@pytest.mark.parametrize("most", [4, 5, 2**32 - 1])
+async def test_more_modes_than_there_are(most: int) -> None:
+    [forecast] = (await predict(make_request(1, max_modes=most), FakeForecaster())).forecasts
+    assert len(forecast.weights) == 4
+    assert forecast.remaining_weight == 0
+
+
+@pytest.mark.parametrize("horizon", [0.5, 3.0, 6.0])
+async def test_horizon(horizon: float) -> None:
+    response = await predict(make_request(1, horizon=horizon), FakeForecaster())
+    assert response.steps == round(2 * horizon)
+    assert means(response.forecasts[0], response).shape == (4, response.steps, 2)
+
+
+async def test_samples_hang_on_seed_and_agent_alone() -> None:
+    async with opened(FakeForecaster()) as plane:
+        alone = await plane.predict(make_request(1, samples=5, seed=3))
+        many = make_request(4, samples=5, seed=3)
+        many.agents.reverse()
+        together, again = await asyncio.gather(plane.predict(many), plane.predict(many))
+        other = await plane.predict(make_request(1, samples=5, seed=4))
+        drawn = await plane.predict(make_request(1, samples=5))
+        redrawn = await plane.predict(make_request(1, samples=5, seed=drawn.seed))
+    assert together.forecasts[3].agent_id == "a0"
+    assert list(together.forecasts[3].samples) == list(alone.forecasts[0].samples)
+    assert [list(f.samples) for f in together.forecasts] == [list(f.samples) for f in again.forecasts]
+    assert list(other.forecasts[0].samples) != list(alone.forecasts[0].samples)
+    assert list(redrawn.forecasts[0].samples) == list(drawn.forecasts[0].samples)
+    assert len(alone.forecasts[0].samples) == 5 * 12 * 2
+    assert alone.seed == 3
+    offsets = [
+        np.array(f.samples).reshape(5, 12, 2)[:, :, 1] - 4 * i
+        for i, f in enumerate(reversed(together.forecasts))
+    ]
+    assert not np.allclose(offsets[0], offsets[1])  # agents do not share their noise
+
+
+async def test_zero_is_a_seed() -> None:
+    async with opened(FakeForecaster()) as plane:
+        first = await plane.predict(make_request(1, samples=2, seed=0))
+        second = await plane.predict(make_request(1, samples=2, seed=0))
+    assert first.seed == 0
+    assert list(first.forecasts[0].samples) == list(second.forecasts[0].samples)
+
+
+async def test_types_that_the_model_does_not_know_fall_back() -> None:
+    request = make_request(1)
+    add_agent(request, "bike", CYCLIST, y=10)
+    add_agent(request, "walker", PEDESTRIAN, y=20)
+    response = await predict(request, FakeForecaster())
+    assert [forecast.status for forecast in response.forecasts] == [OK, FALLBACK, OK]
+    bike = response.forecasts[1]
+    assert bike.model.name == FALLBACK_MODEL
+    assert bike.detail == f"forecast by {FALLBACK_MODEL}: fake does not forecast agents of type cyclist"
+    assert bike.field == ""
+    assert response.model.name == "fake"
+    assert means(bike, response)[0, -1] == pytest.approx([30, 10], abs=1e-3)
+
+
+async def test_a_heading_that_nobody_can_tell_falls_back() -> None:
+    fake = FakeForecaster(needs_heading=True)
+    request = make_request(1)
+    parked = add_agent(request, "parked", speed=0.0, y=8)
+    for state in parked.states:
+        state.ClearField("heading")
+    response = await predict(request, fake)
+    assert [forecast.status for forecast in response.forecasts] == [OK, FALLBACK]
+    assert "heading neither given nor to be told from motion" in response.forecasts[1].detail
+
+
+async def test_short_history() -> None:
+    request = make_request(1)
+    add_agent(request, "new", frames=2, y=8)
+    response = await predict(request, FakeForecaster())
+    new = response.forecasts[1]
+    assert (new.status, new.detail, new.history_frames) == (SHORT, "2 of 3 frames", 2)
+    assert len(new.means) == 4 * 12 * 2
+
+
+async def test_a_single_state_needs_its_velocity() -> None:
+    request = pb.PredictRequest(time=NOW)
+    add_agent(request, "unknown", frames=1)
+    known = add_agent(request, "known", frames=1)
+    known.states[0].velocity_x, known.states[0].velocity_y = 1.0, 0.0
+    response = await predict(request, FakeForecaster())
+    assert [(f.status, f.field) for f in response.forecasts] == [(INVALID, "agents[0].states"), (SHORT, "")]
+
+
+async def test_a_bad_agent_costs_nobody_else() -> None:
+    request = make_request(3)
+    good = await predict(request, FakeForecaster())
+    request.agents[1].states[2].x = float("inf")
+    response = await predict(request, FakeForecaster())
+    bad = response.forecasts[1]
+    assert (bad.status, bad.field) == (INVALID, "agents[1].states[2].x")
+    assert bad.detail == "must be a finite number"
+    assert len(bad.means) == len(bad.weights) == bad.history_frames == 0
+    assert not bad.HasField("model")
+    for index in (0, 2):
+        assert list(response.forecasts[index].means) == list(good.forecasts[index].means)
+
+
+async def test_neighbors_get_no_forecast_but_are_seen() -> None:
+    fake = FakeForecaster()
+    request = make_request(3)
+    request.agents[0].predict = False
+    request.agents[2].predict = True
+    response = await predict(request, fake)
+    assert [forecast.agent_id for forecast in response.forecasts] == ["a1", "a2"]
+    assert len(fake.scenes[-1].types) == 3
+
+
+async def test_invalid_neighbors_are_told() -> None:
+    fake = FakeForecaster()
+    request = make_request(3)
+    request.agents[0].predict = False
+    request.agents[0].states[0].y = float("nan")
+    response = await predict(request, fake)
+    assert [(f.agent_id, f.status) for f in response.forecasts] == [("a0", INVALID), ("a1", OK), ("a2", OK)]
+    assert len(fake.scenes[-1].types) == 2
+
+
+async def test_nobody_to_forecast() -> None:
+    fake = FakeForecaster()
+    assert list((await predict(make_request(0), fake)).forecasts) == []
+    only_context = make_request(1)
+    only_context.agents[0].predict = False
+    assert list((await predict(only_context, fake)).forecasts) == []
+    only_bad = make_request(1)
+    only_bad.agents[0].ClearField("type")
+    response = await predict(only_bad, fake)
+    assert [forecast.status for forecast in response.forecasts] == [INVALID]
+    assert response.timing.batch_agents == 0
+
+
+async def test_scene_has_the_models_frames_only() -> None:
+    fake = FakeForecaster(history_frames=2)
+    await predict(make_request(1), fake)
+    assert fake.scenes[-1].states.frames == 2
+
+
+async def test_map_reaches_the_model() -> None:
+    fake = FakeForecaster(uses_map=True)
+    layers = np.zeros((3, 100, 100), dtype=np.uint8)
+    layers[0, :10] = 1
+    request = make_request(3)
+    request.agents[0].states[0].x = float("nan")
+    request.agents[2].map_patch.image.packed_bits = pack(layers)
+    without = await predict(request, fake)
+    assert without.warnings == [
+        "fake uses the map, but none was given for 1 of 2 agents: it saw an unknown one"
+    ]
+    assert np.array_equal(fake.scenes[-1].patches[1], layers)  # the second of the usable agents
+    raster = request.scene_raster
+    raster.rows = raster.columns = 100
+    raster.origin_x, raster.origin_y, raster.pixels_per_meter = -3.0, 7.0, 2.0
+    raster.image.packed_bits = pack(layers)
+    response = await predict(request, fake)
+    assert list(response.warnings) == []
+    seen = fake.scenes[-1].raster
+    assert seen is not None
+    assert np.array_equal(seen.layers, layers)
+    assert (seen.origin.tolist(), seen.pixels_per_meter) == ([-3.0, 7.0], 2.0)
+
+
+async def test_a_blind_forecast_needs_no_map() -> None:
+    fake = FakeForecaster(uses_map=True)
+    response = await predict(make_request(1, context=pb.CONTEXT_BLIND), fake)
+    assert list(response.warnings) == []
+    assert fake.batches[-1][2] is Context.BLIND
+
+
+async def test_paper_protocol_warns() -> None:
+    response = await predict(make_request(1), FakeForecaster(protocol=Protocol.PAPER))
+    assert response.model.protocol == models_pb.INPUT_PROTOCOL_PAPER
+    assert "trained by the paper protocol" in response.warnings[0]
+
+
+async def test_numbers_that_are_not_finite_are_never_sent() -> None:
+    fake = FakeForecaster()
+    request = make_request(1)
+    add_agent(request, "far", x=5000.0)
+    async with opened(fake) as plane:
+        fake.nan_beyond = 1000.0
+        response = await plane.predict(request)
+        assert [forecast.status for forecast in response.forecasts] == [OK, FALLBACK]
+        assert response.forecasts[1].model.name == FALLBACK_MODEL
+        assert "not finite" in response.forecasts[1].detail
+        assert np.isfinite(response.forecasts[1].means).all()
+        request.options.strict = True
+        with pytest.raises(BadFields):
+            await plane.predict(request)
+
+
+async def test_when_even_the_fallback_fails() -> None:
+    fake = FakeForecaster(FALLBACK_MODEL, version="2.0.0")  # newer, so it is the one
+    request = make_request(1)
+    add_agent(request, "far", x=5000.0)
+    async with opened(fake, default_model=FALLBACK_MODEL) as plane:
+        fake.nan_beyond = 1000.0
+        response = await plane.predict(request)
+    assert [forecast.status for forecast in response.forecasts] == [OK, INVALID]
+    assert response.forecasts[1].field == "agents[1]"
+
+
+async def test_strict_refuses_fallback() -> None:
+    request = make_request(1, strict=True)
+    add_agent(request, "bike", CYCLIST)
+    with pytest.raises(BadFields) as caught:
+        await predict(request, FakeForecaster())
+    assert [fault.field for fault in caught.value.faults] == ["agents[1].type"]
+
+
+async def test_strict_lets_short_history_through() -> None:
+    request = pb.PredictRequest(time=NOW, options=pb.PredictOptions(strict=True))
+    add_agent(request, frames=2)
+    assert (await predict(request, FakeForecaster())).forecasts[0].status == SHORT
+
+
+def change_raster(**values: Any) -> Callable[[pb.PredictRequest], None]:
+    def change(request: pb.PredictRequest) -> None:
+        raster = request.scene_raster
+        raster.rows, raster.columns = 2, 2
+        raster.origin_x, raster.origin_y, raster.pixels_per_meter = 0.0, 0.0, 1.0
+        raster.image.packed_bits = bytes(2)
+        for name, value in values.items():
+            if value is None:
+                raster.ClearField(name)  # type: ignore[arg-type]
+            else:
+                setattr(raster, name, value)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        (lambda r: r.ClearField("time"), "time"),
+        (lambda r: setattr(r, "time", float("nan")), "time"),
+        (lambda r: setattr(r, "time", 1.1e10), "time"),
+        (lambda r: setattr(r, "scene_id", "x" * 129), "scene_id"),
+        (lambda r: setattr(r.options, "horizon", 0.0), "options.horizon"),
+        (lambda r: setattr(r.options, "horizon", 0.7), "options.horizon"),
+        (lambda r: setattr(r.options, "horizon", 6.5), "options.horizon"),
+        (lambda r: setattr(r.options, "horizon", float("inf")), "options.horizon"),
+        (lambda r: setattr(r.options, "samples", 2001), "options.samples"),
+        (lambda r: setattr(r.options, "samples", 60), "options.samples"),
+        (lambda r: setattr(r.options, "context", 9), "options.context"),
+        (lambda r: setattr(r.options, "context", pb.CONTEXT_BLIND), "options.context"),
+        (change_raster(origin_x=None), "scene_raster.origin_x"),
+        (change_raster(origin_y=float("nan")), "scene_raster.origin_y"),
+        (change_raster(origin_y=2e7), "scene_raster.origin_y"),
+        (change_raster(pixels_per_meter=None), "scene_raster.pixels_per_meter"),
+        (change_raster(pixels_per_meter=0.05), "scene_raster.pixels_per_meter"),
+        (change_raster(rows=0), "scene_raster.rows"),
+        (change_raster(columns=0), "scene_raster.columns"),
+        (change_raster(rows=2**31, columns=2**31), "scene_raster.rows"),
+        (change_raster(rows=3), "scene_raster.image.packed_bits"),
+        (change_raster(image=None), "scene_raster.image"),
+        (lambda r: r.scene_raster.SetInParent(), "scene_raster.origin_x"),
+    ],
+)
+async def test_faults_of_the_call(change: Callable[[pb.PredictRequest], None], field: str) -> None:
+    request = make_request(2)
+    change(request)
+    with pytest.raises(BadField) as caught:
+        await predict(request, FakeForecaster(supports_blind=False), max_samples_per_call=100)
+    assert [fault.field for fault in caught.value.faults] == [field]
+
+
+async def test_models_by_name_and_version() -> None:
+    async with opened(FakeForecaster(), FakeForecaster(version="2.0.0")) as plane:
+        newest = await plane.predict(make_request(1))
+        pinned = await plane.predict(make_request(1, model="fake@1.0.0"))
+        assert (newest.model.version, pinned.model.version) == ("2.0.0", "1.0.0")
+        listed = (await plane.list_models(models_pb.ListModelsRequest())).models
+        assert [m.version for m in listed if m.name == "fake"] == ["1.0.0", "2.0.0"]
+        assert [(m.name, m.version) for m in listed if m.is_default] == [("fake", "2.0.0")]
+        got = (await plane.get_model(models_pb.GetModelRequest(name="fake"))).model
+        assert got == next(m for m in listed if m.is_default)
+        assert (got.horizon, got.step, got.modes, got.history_frames) == (6.0, 0.5, 4, 3)
+        assert dict(got.benchmark) == {"fde_ml_6s_m": 1.5}
+        with pytest.raises(UnknownModel):
+            await plane.get_model(models_pb.GetModelRequest(name="nobody"))
+        with pytest.raises(BadField):
+            await plane.get_model(models_pb.GetModelRequest())
+
+
+async def test_default_model() -> None:
+    async with opened() as plane:
+        assert (await plane.predict(make_request(1))).model.name == "kalman"
+    async with opened(FakeForecaster("cab"), default_model=None) as plane:
+        assert (await plane.predict(make_request(1))).model.name == "cab"
+    with pytest.raises(SettingsError, match="nobody"):
+        async with opened(default_model="nobody"):
+            pass
+
+
+async def test_fallback_must_reach_as_far() -> None:
+    with pytest.raises(SettingsError, match="further"):
+        async with opened(FakeForecaster(steps=16)):
+            pass
+
+
+async def test_warm_up_meets_every_shape() -> None:
+    fake, other = FakeForecaster(), FakeForecaster("other", supports_blind=False)
+    plane = DataPlane(settings(default_model="fake", max_batch_agents=6), Metrics())
+    await plane.open(lambda: registry(fake, other))
+    await plane.close()
+    sizes = [agents for kind, agents, context, _ in fake.batches if context is Context.BLIND]
+    assert sizes == [1, 2, 4, 6] * 2  # vehicles and pedestrians
+    assert [agents for _, agents, _, _ in other.batches] == [1, 6] * 2
+
+
+async def test_phases() -> None:
+    fake = FakeForecaster()
+    plane = DataPlane(settings(default_model="fake"), Metrics())
+    assert plane.phase is Phase.STARTING
+    with pytest.raises(Unavailable, match="starting"):
+        await plane.predict(make_request(1))
+    await plane.open(lambda: registry(fake))
+    fake.forget()
+    fake.free.clear()
+    call = asyncio.create_task(plane.predict(make_request(1)))
+    assert await asyncio.to_thread(fake.entered.wait, 10)
+    assert not await plane.drain(0.01)
+    assert str(plane.phase) == Phase.DRAINING
+    with pytest.raises(Unavailable, match="draining"):
+        await plane.list_models(models_pb.ListModelsRequest())
+    fake.free.set()
+    assert await plane.drain(10)
+    assert len((await call).forecasts) == 1
+    await plane.close()

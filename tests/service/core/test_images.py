@@ -1,0 +1,111 @@
+"""Map layers: what is accepted comes out bit for bit, and nothing else is accepted."""
+
+import struct
+import zlib
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cab.forecast.v1 import prediction_service_pb2 as pb
+from model.arrays import Bytes
+from service.core.images import decode_layers
+from service.errors import BadField
+from tests.service.requests import pack, png
+
+MAX = 10_000
+
+
+def layers(rows: int, columns: int) -> Bytes:
+    return (np.random.default_rng(rows + columns).random((3, rows, columns)) > 0.5).astype(np.uint8)
+
+
+def decode(
+    image: pb.LayerImage, rows: int | None = None, columns: int | None = None, max_pixels: int = MAX
+) -> Bytes:
+    return decode_layers(image, "image", rows, columns, max_pixels)
+
+
+def refusal(image: pb.LayerImage, rows: int | None = None, columns: int | None = None) -> str:
+    with pytest.raises(BadField) as caught:
+        decode(image, rows, columns)
+    [fault] = caught.value.faults
+    assert fault.field.startswith("image")
+    return fault.detail
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 7), (8, 8), (100, 100)])
+def test_both_encodings_give_the_bits(size: tuple[int, int]) -> None:
+    expected = layers(*size)
+    assert np.array_equal(decode(pb.LayerImage(packed_bits=pack(expected)), *size), expected)
+    assert np.array_equal(decode(pb.LayerImage(png=png(expected)), *size), expected)
+    assert np.array_equal(decode(pb.LayerImage(png=png(expected))), expected)
+
+
+def test_order_of_bits() -> None:
+    decoded = decode(pb.LayerImage(packed_bits=bytes([0b1000_0001, 0b0000_0000])), 2, 2)
+    assert np.flatnonzero(decoded).tolist() == [0, 7]  # [layer, row, column], the highest bit first
+
+
+def test_packed_sizes_are_checked() -> None:
+    assert "need 150 bytes, got 149" in refusal(pb.LayerImage(packed_bits=bytes(149)), 20, 20)
+    assert "zeros" in refusal(pb.LayerImage(packed_bits=bytes([0b1110_0001])), 1, 1)
+    assert "rows and columns" in refusal(pb.LayerImage(packed_bits=bytes(150)))
+
+
+def test_nothing_is_refused() -> None:
+    assert refusal(pb.LayerImage()) == "give packed_bits or png"
+
+
+@pytest.mark.parametrize("mode", ["RGBA", "L", "1", "P"])
+def test_other_kinds_of_png_are_refused(mode: str) -> None:
+    assert refusal(pb.LayerImage(png=png(layers(4, 4), mode=mode))) == "must be 8-bit RGB without alpha"
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "BMP", "TIFF", "WEBP"])
+def test_other_formats_are_refused(kind: str) -> None:
+    assert refusal(pb.LayerImage(png=png(layers(8, 8), kind=kind))) == "is not a PNG"
+
+
+def test_sizes_are_checked() -> None:
+    image = pb.LayerImage(png=png(layers(4, 5)))
+    assert refusal(image, 5, 4) == "is 4 × 5 pixels, expected 5 × 4"
+    assert refusal(image, 3, None) == "is 4 × 5 pixels, expected 3 × any"
+    with pytest.raises(BadField, match="1 to 19 are accepted"):
+        decode(image, max_pixels=19)
+
+
+def test_a_bomb_is_refused_for_what_it_says() -> None:
+    assert "are accepted" in refusal(pb.LayerImage(png=_raw_png(60_000, 60_000, b"\0" * 1000)))
+
+
+def test_a_png_that_holds_less_than_it_says_is_refused() -> None:
+    assert "cannot be decoded" in refusal(pb.LayerImage(png=_raw_png(100, 100, b"\0" * 10)))
+
+
+def test_a_png_that_holds_more_than_it_says_is_cut_off() -> None:
+    bomb = _raw_png(2, 2, b"\0" * 10_000_000)
+    assert decode(pb.LayerImage(png=bomb), 2, 2).shape == (3, 2, 2)
+
+
+@given(st.data())
+def test_broken_bytes_never_do_harm(data: st.DataObject) -> None:
+    good = bytearray(png(layers(5, 5)))
+    for _ in range(data.draw(st.integers(1, 4))):
+        good[data.draw(st.integers(0, len(good) - 1))] = data.draw(st.integers(0, 255))
+    cut = bytes(good[: data.draw(st.integers(0, len(good)))])
+    try:
+        decoded = decode(pb.LayerImage(png=cut))
+    except BadField:
+        return
+    assert decoded.max(initial=0) <= 1
+
+
+def _raw_png(width: int, height: int, pixels: bytes) -> bytes:
+    def chunk(name: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    parts = [chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(pixels)), chunk(b"IEND", b"")]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)

@@ -1,0 +1,83 @@
+"""Settings: what goes before what, and what is refused."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from service.settings import SettingsError, load, split_address
+
+
+@pytest.fixture(autouse=True)
+def clean(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("FORECAST_CONFIG", raising=False)
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    file = tmp_path / "server.toml"
+    file.write_text('http = "0.0.0.0:1"\ngrpc = "0.0.0.0:2"\nlog_level = "debug"\napi_tokens = ["a", "b"]\n')
+    return file
+
+
+def test_defaults() -> None:
+    settings = load()
+    assert (settings.http, settings.grpc, settings.store) == ("127.0.0.1:8080", "127.0.0.1:50051", "memory")
+    assert settings.default_model is None
+    assert settings.api_tokens == ()
+
+
+def test_flags_then_environment_then_file(config: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FORECAST_GRPC", "0.0.0.0:3")
+    monkeypatch.setenv("FORECAST_LOG_LEVEL", "WARNING")
+    settings = load(config, log_level="error", http=None)
+    assert (settings.http, settings.grpc, settings.log_level) == ("0.0.0.0:1", "0.0.0.0:3", "error")
+
+
+def test_file_from_the_environment(config: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FORECAST_CONFIG", str(config))
+    assert load().http == "0.0.0.0:1"
+
+
+def test_tokens_are_read_and_not_shown(config: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert [token.get_secret_value() for token in load(config).api_tokens] == ["a", "b"]
+    monkeypatch.setenv("FORECAST_API_TOKENS", "s3cret, other,")
+    settings = load()
+    assert [token.get_secret_value() for token in settings.api_tokens] == ["s3cret", "other"]
+    assert "s3cret" not in repr(settings)
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ({"store": "redis://localhost"}, 'store: "redis://localhost" is not supported'),
+        ({"http": "8080"}, 'http: "8080" is not HOST:PORT'),
+        ({"grpc": "host:99999"}, "grpc: .* is not HOST:PORT"),
+        ({"max_agents": 0}, "max_agents: "),
+        ({"log_level": "loud"}, "log_level: "),
+        ({"max_queue_agents": 10}, "max_queue_agents must be at least max_agents"),
+        ({"colour": "red"}, "colour: "),
+    ],
+)
+def test_refused(flags: dict[str, Any], message: str) -> None:
+    with pytest.raises(SettingsError, match=message):
+        load(**flags)
+
+
+def test_bad_files(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="no such configuration file"):
+        load(tmp_path / "missing.toml")
+    (tmp_path / "typo.toml").write_text('htpp = "127.0.0.1:1"\n')
+    with pytest.raises(SettingsError, match="htpp"):
+        load(tmp_path / "typo.toml")
+    (tmp_path / "broken.toml").write_text("http = \n")
+    with pytest.raises(SettingsError, match=r"broken\.toml"):
+        load(tmp_path / "broken.toml")
+
+
+def test_addresses() -> None:
+    assert split_address("localhost:80") == ("localhost", 80)
+    assert split_address("[::1]:0") == ("::1", 0)
+    for wrong in ("", "localhost", ":80", "a:b", "a:-1"):
+        with pytest.raises(ValueError, match="HOST:PORT"):
+            split_address(wrong)
