@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from cab.forecast.v1.prediction_service_pb2 import CONTEXT_BLIND, PredictResponse
 from google.protobuf import json_format
 from typer.testing import CliRunner
 
+from cab.forecast.v1.prediction_service_pb2 import CONTEXT_BLIND, PredictResponse
 from cab_forecast import demo_request
 from service.cli.main import app
 from tests.cab_forecast.answers import answer

@@ -1,0 +1,1 @@
+"""gRPC: the contract's services, health and reflection."""

@@ -1,0 +1,68 @@
+"""The gRPC server."""
+
+from grpc import aio
+from grpc_health.v1 import health, health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection
+
+from service.api.auth import Tokens
+from service.api.grpc.handlers import MODEL_SERVICE, PREDICTION_SERVICE, Handlers
+from service.api.grpc.interceptor import AuthInterceptor
+from service.core.dataplane import DataPlane
+from service.settings import Settings
+from service.telemetry.metrics import Metrics
+
+_SERVICES = (PREDICTION_SERVICE, MODEL_SERVICE)
+_UNLIMITED = -1
+_TRANSPORT_MARGIN = 2
+"""Up to this many times the request limit a message is received, to be refused with details; beyond it
+gRPC itself refuses, with the same code but without."""
+
+
+class GrpcServer:
+    """The contract's services with health and reflection on one port."""
+
+    def __init__(self, dataplane: DataPlane, metrics: Metrics, settings: Settings) -> None:
+        self._settings = settings
+        self._server = aio.server(
+            interceptors=[AuthInterceptor(Tokens(settings.api_tokens), metrics)],
+            options=[
+                ("grpc.max_receive_message_length", settings.max_request_bytes * _TRANSPORT_MARGIN),
+                ("grpc.max_send_message_length", _UNLIMITED),
+                ("grpc.so_reuseport", 0),  # or a second server would share the port in silence
+            ],
+        )
+        self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]  # missing in the stubs
+        handlers = Handlers(dataplane, metrics, settings.max_request_bytes)
+        self._server.add_generic_rpc_handlers(tuple(handlers.generic()))
+        health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
+        names = (*_SERVICES, health.SERVICE_NAME, reflection.SERVICE_NAME)
+        reflection.enable_server_reflection(names, self._server)
+        self.address = ""
+        """HOST:PORT that is listened on."""
+
+    async def start(self) -> None:
+        """Listens; calls are answered from now on.
+
+        Raises:
+            OSError: the port is taken or the host is not ours.
+        """
+        await self.set_serving(False)
+        host = self._settings.grpc.rpartition(":")[0]
+        try:
+            port = self._server.add_insecure_port(self._settings.grpc)
+        except RuntimeError as error:
+            raise OSError(str(error)) from error
+        self.address = f"{host}:{port}"
+        await self._server.start()
+
+    async def set_serving(self, serving: bool) -> None:
+        """Tells health, for "" and each service."""
+        status = (
+            health_pb2.HealthCheckResponse.SERVING if serving else health_pb2.HealthCheckResponse.NOT_SERVING
+        )
+        for name in ("", *_SERVICES):
+            await self._health.set(name, status)
+
+    async def stop(self, grace: float) -> None:
+        """Takes no more calls and gives those under way so many seconds."""
+        await self._server.stop(grace)

@@ -1,0 +1,54 @@
+"""Errors as google.rpc.Status with details."""
+
+from collections.abc import Sequence
+
+import grpc
+from google.protobuf import any_pb2, duration_pb2
+from google.protobuf.message import Message
+from google.rpc import error_details_pb2, status_pb2
+
+from service.errors import DOMAIN, Fault, ServiceError
+
+DETAILS_KEY = "grpc-status-details-bin"
+"""Trailing metadata that carries the status."""
+_MAX_VIOLATION_BYTES = 4096
+"""Violations listed, encoded: metadata is limited to 8 KiB by default, and the first few dozens of faults
+tell what is going on."""
+_MAX_TEXT = 200
+"""Characters of any text that may hold what the client sent."""
+
+
+def to_status(error: ServiceError) -> status_pb2.Status:
+    """The status of an error: ErrorInfo always, BadRequest with faults, RetryInfo when a retry helps."""
+    details = [_pack(error_details_pb2.ErrorInfo(reason=error.reason, domain=DOMAIN))]
+    if error.faults:
+        details.append(_pack(_bad_request(error.faults)))
+    if error.retry_after is not None:
+        delay = duration_pb2.Duration()
+        delay.FromNanoseconds(round(error.retry_after * 1e9))
+        details.append(_pack(error_details_pb2.RetryInfo(retry_delay=delay)))
+    code: int = grpc.StatusCode[error.code].value[0]
+    return status_pb2.Status(code=code, message=error.detail[:_MAX_TEXT], details=details)
+
+
+async def abort(context: "grpc.aio.ServicerContext[object, object]", error: ServiceError) -> None:
+    """Ends a call with an error; raises, as ``context.abort`` does."""
+    status = to_status(error)
+    metadata = ((DETAILS_KEY, status.SerializeToString()),)
+    await context.abort(grpc.StatusCode[error.code], status.message, metadata)
+
+
+def _bad_request(faults: Sequence[Fault]) -> error_details_pb2.BadRequest:
+    """As many of the faults as there is room for, at least one."""
+    message = error_details_pb2.BadRequest()
+    for fault in faults:
+        message.field_violations.add(field=fault.field[:_MAX_TEXT], description=fault.detail[:_MAX_TEXT])
+        if message.ByteSize() > _MAX_VIOLATION_BYTES:
+            break
+    return message
+
+
+def _pack(message: Message) -> any_pb2.Any:
+    packed = any_pb2.Any()
+    packed.Pack(message)
+    return packed

@@ -1,0 +1,1 @@
+"""REST: the contract's messages as JSON or protobuf over HTTP."""

@@ -1,0 +1,81 @@
+"""The HTTP application."""
+
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import prometheus_client
+from fastapi import FastAPI
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response
+
+from service.api.auth import Tokens
+from service.api.boundary import to_service_error
+from service.api.rest.endpoints import Endpoints
+from service.api.rest.openapi import openapi_document
+from service.api.rest.problem import problem_response
+from service.core.dataplane import DataPlane, Phase
+from service.errors import BadField, MethodNotAllowed, NotFound, ServiceError, Unavailable
+from service.settings import Settings
+from service.telemetry.metrics import Metrics
+
+
+def build_app(dataplane: DataPlane, metrics: Metrics, settings: Settings) -> FastAPI:
+    """All routes.
+
+    Args:
+        dataplane: what answers.
+        metrics: what is counted, and shown at ``/metrics``.
+        settings: limits and tokens.
+    """
+    document = openapi_document(settings)
+    app = FastAPI(
+        title=document["info"]["title"],
+        version=document["info"]["version"],
+        docs_url="/docs",
+        redoc_url=None,
+        exception_handlers={HTTPException: _on_http_error, Exception: _on_error},
+    )
+    app.openapi = lambda: document  # type: ignore[method-assign]  # the way that FastAPI documents
+
+    endpoints = Endpoints(dataplane, metrics, Tokens(settings.api_tokens), settings.max_request_bytes)
+    routes: list[tuple[str, str, Callable[[Request], Awaitable[Response]]]] = [
+        ("POST", "/v1/predict", endpoints.predict),
+        ("GET", "/v1/models", endpoints.list_models),
+        ("GET", "/v1/models/{name}", endpoints.get_model),
+    ]
+    for method, path, endpoint in routes:
+        app.add_route(path, endpoint, methods=[method])
+
+    async def livez(_: Request) -> Response:
+        return PlainTextResponse("alive\n")
+
+    async def readyz(_: Request) -> Response:
+        if dataplane.phase is Phase.READY:
+            return PlainTextResponse("ready\n")
+        return problem_response(Unavailable(f"the server is {dataplane.phase.value}"))
+
+    async def show_metrics(_: Request) -> Response:
+        return Response(metrics.render(), media_type=prometheus_client.CONTENT_TYPE_LATEST)
+
+    app.add_route("/livez", livez, methods=["GET"])
+    app.add_route("/readyz", readyz, methods=["GET"])
+    app.add_route("/metrics", show_metrics, methods=["GET"])
+    return app
+
+
+async def _on_http_error(request: Request, exception: Any) -> Response:
+    """What the framework itself refuses, in the table's words."""
+    address = f"{request.method} {request.url.path}"
+    error: ServiceError
+    if exception.status_code == NotFound.http_status:
+        error = NotFound(f"nothing answers {address[:200]}")
+    elif exception.status_code == MethodNotAllowed.http_status:
+        error = MethodNotAllowed(f"{address[:200]} is not a method of this address")
+    else:
+        error = BadField("request", str(exception.detail))
+    return problem_response(error, exception.headers)
+
+
+async def _on_error(request: Request, exception: Exception) -> Response:
+    return problem_response(to_service_error(exception, request.url.path))

@@ -1,0 +1,48 @@
+"""Requests that work as they stand, for the documentation."""
+
+from typing import Any
+
+from model.scene import STEP_SECONDS
+
+_NOW = 1_700_000_000.0
+_FRAMES = 9
+
+
+def predict_examples() -> dict[str, dict[str, Any]]:
+    """Examples of ``POST /v1/predict`` by name, as OpenAPI has them."""
+    car = _agent("car-1", "AGENT_TYPE_VEHICLE", x=100.0, y=50.0, speed=8.0)
+    walker = _agent("walker-1", "AGENT_TYPE_PEDESTRIAN", x=110.0, y=56.0, speed=1.4)
+    parked = _agent("car-2", "AGENT_TYPE_VEHICLE", x=130.0, y=47.0, speed=0.0) | {"predict": False}
+    return {
+        "one_car": {
+            "summary": "One car, the server's default model",
+            "value": {"time": _NOW, "agents": [car]},
+        },
+        "street": {
+            "summary": "A car and a pedestrian beside a parked car; the three most likely modes, 3 s ahead",
+            "value": {
+                "scene_id": "street-1",
+                "time": _NOW,
+                "agents": [car, walker, parked],
+                "options": {"max_modes": 3, "horizon": 3.0},
+            },
+        },
+        "samples": {
+            "summary": "Ten sampled trajectories from a named model",
+            "value": {
+                "time": _NOW,
+                "model": "kalman",
+                "agents": [car],
+                "options": {"max_modes": 1, "samples": 10, "seed": 7},
+            },
+        },
+    }
+
+
+def _agent(agent_id: str, kind: str, x: float, y: float, speed: float) -> dict[str, Any]:
+    """An agent on its way along x, now at (x, y)."""
+    states = []
+    for age in range(_FRAMES - 1, -1, -1):
+        seconds = age * STEP_SECONDS
+        states.append({"time": _NOW - seconds, "x": round(x - speed * seconds, 3), "y": y, "heading": 0.0})
+    return {"id": agent_id, "type": kind, "states": states}

@@ -1,0 +1,41 @@
+"""Errors as problem+json (RFC 9457)."""
+
+import math
+from typing import Any
+
+import orjson
+from starlette.responses import Response
+
+from service.errors import ServiceError, Unauthenticated
+
+MEDIA_TYPE = "application/problem+json"
+
+
+def to_problem(error: ServiceError) -> dict[str, Any]:
+    """The problem document of an error."""
+    return {
+        "type": error.type_uri(),
+        "title": error.title,
+        "status": error.http_status,
+        "detail": error.detail,
+        "code": error.code,
+        "reason": error.reason,
+        "errors": [{"field": fault.field, "detail": fault.detail} for fault in error.faults],
+    }
+
+
+def problem_response(error: ServiceError, headers: dict[str, str] | None = None) -> Response:
+    """The answer that an error becomes.
+
+    Args:
+        error: what went wrong.
+        headers: more headers.
+    """
+    headers = dict(headers or {})
+    if error.retry_after is not None:
+        headers["Retry-After"] = str(max(1, math.ceil(error.retry_after)))  # whole seconds, by RFC 9110
+    if isinstance(error, Unauthenticated):
+        headers["WWW-Authenticate"] = "Bearer"
+    return Response(
+        orjson.dumps(to_problem(error)), status_code=error.http_status, media_type=MEDIA_TYPE, headers=headers
+    )

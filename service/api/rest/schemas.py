@@ -1,0 +1,154 @@
+"""JSON schemas of the contract's messages, from their descriptors and comments."""
+
+from typing import Any
+
+from google.protobuf.descriptor import Descriptor, EnumDescriptor, FieldDescriptor
+
+from cab.forecast.v1 import model_service_pb2 as models_pb
+from cab.forecast.v1 import prediction_service_pb2 as pb
+from service.api.rest.comments import comments
+from service.core.options import MAX_ID_LENGTH, MAX_POSITION, MAX_TIME
+from service.settings import Settings
+
+Schema = dict[str, Any]
+
+_UINT32_MAX = 2**32 - 1
+_SCALARS: dict[int, Schema] = {
+    FieldDescriptor.TYPE_DOUBLE: {"type": "number", "format": "double"},
+    FieldDescriptor.TYPE_BYTES: {"type": "string", "format": "byte"},
+    FieldDescriptor.TYPE_STRING: {"type": "string"},
+    FieldDescriptor.TYPE_BOOL: {"type": "boolean"},
+    FieldDescriptor.TYPE_UINT32: {"type": "integer", "minimum": 0, "maximum": _UINT32_MAX},
+}
+_ROOTS = (pb.PredictRequest, pb.PredictResponse, models_pb.ListModelsResponse, models_pb.GetModelResponse)
+_REQUEST_ROOT = pb.PredictRequest.DESCRIPTOR
+
+# What the comments of the contract say in words; a descriptor cannot.
+REQUIRED = {
+    "PredictRequest": ["time"],
+    "Agent": ["id", "type", "states"],
+    "AgentState": ["time", "x", "y"],
+    "MapPatch": ["image"],
+    "SceneRaster": ["image", "origin_x", "origin_y", "pixels_per_meter"],
+}
+
+
+def bounds(settings: Settings) -> dict[str, Schema]:
+    """Limits of the request's fields by "Message.field"."""
+
+    def within(limit: float) -> Schema:
+        return {"minimum": -limit, "maximum": limit}
+
+    return {
+        "PredictRequest.scene_id": {"maxLength": MAX_ID_LENGTH},
+        "PredictRequest.time": within(MAX_TIME),
+        "PredictRequest.agents": {"maxItems": settings.max_agents},
+        "Agent.id": {"minLength": 1, "maxLength": MAX_ID_LENGTH},
+        "Agent.states": {"minItems": 1, "maxItems": settings.max_states},
+        "AgentState.time": within(MAX_TIME),
+        "AgentState.x": within(MAX_POSITION),
+        "AgentState.y": within(MAX_POSITION),
+        "AgentState.heading": within(1e4),
+        "AgentState.velocity_x": within(150.0),
+        "AgentState.velocity_y": within(150.0),
+        "AgentState.acceleration_x": within(100.0),
+        "AgentState.acceleration_y": within(100.0),
+        "AgentState.heading_rate": within(20.0),
+        "SceneRaster.rows": {"maximum": settings.max_raster_pixels},
+        "SceneRaster.columns": {"maximum": settings.max_raster_pixels},
+        "SceneRaster.origin_x": within(MAX_POSITION),
+        "SceneRaster.origin_y": within(MAX_POSITION),
+        "SceneRaster.pixels_per_meter": {"minimum": 0.1, "maximum": 100.0},
+        "PredictOptions.samples": {"maximum": settings.max_samples},
+        "PredictOptions.horizon": {"minimum": 0.5, "multipleOf": 0.5},
+    }
+
+
+def message_schemas(settings: Settings) -> dict[str, Schema]:
+    """Schemas of all messages and enums that REST carries, by name."""
+    requests = _reachable(_REQUEST_ROOT)
+    limits = bounds(settings)
+    schemas: dict[str, Schema] = {}
+    for root in _ROOTS:
+        for descriptor in _reachable(root.DESCRIPTOR):
+            schemas[descriptor.name] = _message(descriptor, descriptor in requests, limits)
+            for field in descriptor.fields:
+                if field.enum_type is not None:
+                    schemas[field.enum_type.name] = _enum(field.enum_type)
+    return dict(sorted(schemas.items()))
+
+
+def reference(name: str) -> Schema:
+    """Points at a schema."""
+    return {"$ref": f"#/components/schemas/{name}"}
+
+
+def _reachable(descriptor: Descriptor) -> list[Descriptor]:
+    """A message and all within it; maps are no messages of their own here."""
+    found: list[Descriptor] = []
+    pending = [descriptor]
+    while pending:
+        current = pending.pop()
+        if current in found:
+            continue
+        found.append(current)
+        inner = [field.message_type for field in current.fields if field.message_type is not None]
+        pending.extend(kind for kind in inner if not kind.GetOptions().map_entry)
+    return found
+
+
+def _message(descriptor: Descriptor, is_request: bool, limits: dict[str, Schema]) -> Schema:
+    properties = {
+        field.name: _field(field, f"{descriptor.name}.{field.name}", limits) for field in descriptor.fields
+    }
+    schema: Schema = {"type": "object", "properties": properties}
+    _describe(schema, descriptor.name)
+    if is_request:
+        required = REQUIRED.get(descriptor.name, [])
+        schema["additionalProperties"] = False
+    else:
+        required = [field.name for field in descriptor.fields if not field.has_presence]
+    if required:
+        schema["required"] = required
+    choices = [oneof for oneof in descriptor.oneofs if not oneof.name.startswith("_")]
+    if choices:
+        schema["oneOf"] = [{"required": [field.name]} for oneof in choices for field in oneof.fields]
+    return schema
+
+
+def _field(field: FieldDescriptor, name: str, limits: dict[str, Schema]) -> Schema:
+    kind = field.message_type
+    schema: Schema
+    if kind is not None and kind.GetOptions().map_entry:
+        schema = {"type": "object", "additionalProperties": _single(kind.fields_by_name["value"])}
+    elif field.is_repeated:
+        schema = {"type": "array", "items": _single(field)}
+    else:
+        schema = _single(field)
+    schema |= limits.get(name, {})
+    _describe(schema, name)
+    return schema
+
+
+def _single(field: FieldDescriptor) -> Schema:
+    if field.message_type is not None:
+        return reference(field.message_type.name)
+    if field.enum_type is not None:
+        return reference(field.enum_type.name)
+    return dict(_SCALARS[field.type])
+
+
+def _enum(kind: EnumDescriptor) -> Schema:
+    names = [value.name for value in kind.values]
+    texts = comments()
+    lines = [texts.get(kind.name, "")]
+    lines += [
+        f"- `{name}`: {texts[f'{kind.name}.{name}']}" for name in names if f"{kind.name}.{name}" in texts
+    ]
+    return {"type": "string", "enum": names, "description": "\n".join(line for line in lines if line)}
+
+
+def _describe(schema: Schema, name: str) -> None:
+    text = comments().get(name)
+    if text:
+        schema["description"] = text

@@ -1,0 +1,128 @@
+"""The OpenAPI document: true to the contract, and its examples work."""
+
+from typing import Any
+
+import httpx
+import pytest
+from pydantic import SecretStr
+
+from cab.forecast.v1 import model_service_pb2 as models_pb
+from cab.forecast.v1 import prediction_service_pb2 as pb
+from service.api.rest.comments import comments, parse_comments
+from service.api.rest.examples import predict_examples
+from service.api.rest.openapi import openapi_document
+from service.api.rest.schemas import REQUIRED, bounds
+from service.settings import Settings
+from tests.service.fakes import FakeForecaster
+from tests.service.servers import running
+
+DOCUMENT = openapi_document(Settings())
+SCHEMAS: dict[str, Any] = DOCUMENT["components"]["schemas"]
+
+
+def test_every_message_field_and_value_has_its_comment_or_a_neighbor_has() -> None:
+    texts = comments()
+    for file in (pb.DESCRIPTOR, models_pb.DESCRIPTOR):
+        for name, service in file.services_by_name.items():
+            assert name in texts
+            assert all(f"{name}.{method.name}" in texts for method in service.methods)
+    assert texts["PredictRequest.time"].startswith("The present: forecasts start here.")
+    assert texts["LayerImage.png"].startswith("An 8-bit RGB image")
+    assert texts["ForecastStatus.FORECAST_STATUS_SHORT_HISTORY"].startswith("A forecast from fewer")
+    assert texts["Model.benchmark"].startswith("Benchmark figures")
+    known = {m for file in (pb.DESCRIPTOR, models_pb.DESCRIPTOR) for m in file.message_types_by_name}
+    known |= {e for file in (pb.DESCRIPTOR, models_pb.DESCRIPTOR) for e in file.enum_types_by_name}
+    known |= {s for file in (pb.DESCRIPTOR, models_pb.DESCRIPTOR) for s in file.services_by_name}
+    assert {name.partition(".")[0] for name in texts} <= known
+
+
+def test_comments_of_nested_blocks() -> None:
+    source = """
+    // Lost: a blank line follows.
+
+    // Outer.
+    message Outer {
+      oneof choice {
+        // One.
+        string one = 1;
+      }
+      // Empty.
+      message Empty {}
+      // Two,
+      // in two lines.
+      repeated a.b.C two = 2;
+      int32 three = 3;
+    }
+    """
+    assert parse_comments(source) == {
+        "Outer": "Outer.",
+        "Outer.one": "One.",
+        "Outer.Empty": "Empty.",
+        "Outer.two": "Two, in two lines.",
+    }
+
+
+def test_schemas_have_the_messages_fields() -> None:
+    for name, descriptor in pb.DESCRIPTOR.message_types_by_name.items():
+        assert list(SCHEMAS[name]["properties"]) == [field.name for field in descriptor.fields]
+    assert SCHEMAS["Agent"]["additionalProperties"] is False
+    assert SCHEMAS["Agent"]["properties"]["type"]["$ref"] == "#/components/schemas/AgentType"
+    assert SCHEMAS["AgentType"]["enum"][1] == "AGENT_TYPE_VEHICLE"
+    assert SCHEMAS["Model"]["properties"]["benchmark"]["additionalProperties"]["type"] == "number"
+    assert SCHEMAS["LayerImage"]["oneOf"] == [{"required": ["packed_bits"]}, {"required": ["png"]}]
+    assert "weights" in SCHEMAS["AgentForecast"]["required"]
+    assert "model" not in SCHEMAS["AgentForecast"]["required"]
+
+
+def test_hand_written_parts_name_real_fields() -> None:
+    messages = pb.DESCRIPTOR.message_types_by_name
+    for name, fields in REQUIRED.items():
+        assert set(fields) <= {field.name for field in messages[name].fields}
+    for path in bounds(Settings()):
+        name, _, field = path.partition(".")
+        assert field in messages[name].fields_by_name
+
+
+def test_references_lead_somewhere() -> None:
+    def walk(node: Any) -> None:
+        if isinstance(node, dict):
+            if "$ref" in node:
+                assert node["$ref"].removeprefix("#/components/schemas/") in SCHEMAS
+            for value in node.values():
+                walk(value)
+        elif isinstance(node, list):
+            for value in node:
+                walk(value)
+
+    walk(DOCUMENT)
+
+
+def test_errors_are_documented() -> None:
+    responses = DOCUMENT["paths"]["/v1/predict"]["post"]["responses"]
+    assert sorted(responses) == ["200", "401", "404", "406", "413", "415", "422", "429", "500", "503", "504"]
+    assert "Retry-After" in responses["429"]["headers"]
+    assert "application/problem+json" in responses["422"]["content"]
+
+
+def test_security_is_documented_when_there_is_some() -> None:
+    assert "securitySchemes" not in DOCUMENT["components"]
+    secured = openapi_document(Settings(api_tokens=(SecretStr("x"),)))
+    assert secured["paths"]["/v1/predict"]["post"]["security"] == [{"bearer": []}]
+    assert "security" not in secured["paths"]["/livez"]["get"]
+
+
+@pytest.mark.parametrize("default", ["baselines", "fake"])
+async def test_examples_work(default: str) -> None:
+    fakes = [FakeForecaster(history_frames=9)] if default == "fake" else []
+    async with running(*fakes) as server, httpx.AsyncClient() as client:
+        base = f"http://{server.http_address}"
+        document = (await client.get(f"{base}/openapi.json")).json()
+        content = document["paths"]["/v1/predict"]["post"]["requestBody"]["content"]
+        examples = content["application/json"]["examples"]
+        assert examples == predict_examples()
+        for example in examples.values():
+            response = await client.post(f"{base}/v1/predict", json=example["value"])
+            assert response.status_code == 200, response.text
+            forecasts = response.json()["forecasts"]
+            assert forecasts
+            assert all(forecast["status"] == "FORECAST_STATUS_OK" for forecast in forecasts)

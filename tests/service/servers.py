@@ -1,0 +1,140 @@
+"""Real servers on free ports, and ways to call them."""
+
+import asyncio
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import grpc
+import httpx
+from google.rpc import error_details_pb2, status_pb2
+
+from cab.forecast.v1 import prediction_service_pb2 as pb
+from model.forecaster import Forecaster
+from service.server import Server
+from service.settings import Settings
+from tests.service.fakes import registry
+
+PREDICT = "/cab.forecast.v1.PredictionService/Predict"
+
+
+def settings(**values: Any) -> Settings:
+    """Settings on free ports, with a short warm-up."""
+    free: dict[str, Any] = {"http": "127.0.0.1:0", "grpc": "127.0.0.1:0", "max_batch_agents": 64}
+    return Settings(**(free | values))
+
+
+@asynccontextmanager
+async def running(*forecasters: Forecaster, **values: Any) -> AsyncIterator[Server]:
+    """A server with the baselines and those forecasters, the first of which is the default."""
+    default = {"default_model": forecasters[0].info.name} if forecasters else {}
+    server = Server(settings(**(default | values)), load=lambda: registry(*forecasters))
+    await server.start()
+    for forecaster in forecasters:
+        if hasattr(forecaster, "forget"):
+            forecaster.forget()
+    try:
+        yield server
+    finally:
+        await server.stop()
+
+
+async def until_waiting(server: Server, agents: int) -> None:
+    """Returns when so many agents are queued."""
+    async with asyncio.timeout(10):
+        while server.metrics.registry.get_sample_value("forecast_queue_agents") != agents:  # noqa: ASYNC110 - no event tells
+            await asyncio.sleep(0.005)
+
+
+@dataclass
+class CallError(Exception):
+    """An error as a client sees it, on any transport."""
+
+    code: str
+    message: str
+    reason: str
+    faults: list[tuple[str, str]] = field(default_factory=list)
+    retry_after: float | None = None
+    http_status: int | None = None
+
+
+async def call_grpc(
+    server: Server,
+    request: pb.PredictRequest | bytes,
+    metadata: Mapping[str, str] | None = None,
+    timeout: float | None = 20,  # noqa: ASYNC109 - it travels
+) -> pb.PredictResponse:
+    """Predict over gRPC."""
+    options = [("grpc.max_receive_message_length", -1), ("grpc.use_local_subchannel_pool", 1)]
+    async with grpc.aio.insecure_channel(server.grpc_address, options=options) as channel:
+        try:
+            answer: bytes = await channel.unary_unary(PREDICT, None, None)(
+                request if isinstance(request, bytes) else request.SerializeToString(),
+                metadata=tuple((metadata or {}).items()),
+                timeout=timeout,
+            )
+        except grpc.aio.AioRpcError as error:
+            raise _from_grpc(error) from error
+    return pb.PredictResponse.FromString(answer)
+
+
+async def call_rest(
+    server: Server,
+    request: pb.PredictRequest | bytes,
+    metadata: Mapping[str, str] | None = None,
+    timeout: float | None = None,  # noqa: ASYNC109 - it travels
+) -> pb.PredictResponse:
+    """Predict over REST, with protobuf bodies."""
+    headers = {"content-type": "application/x-protobuf"} | dict(metadata or {})
+    if timeout is not None:
+        headers["Request-Timeout"] = str(timeout)
+    body = request if isinstance(request, bytes) else request.SerializeToString()
+    async with httpx.AsyncClient(timeout=20) as client:
+        response = await client.post(
+            f"http://{server.http_address}/v1/predict", content=body, headers=headers
+        )
+    if response.status_code != httpx.codes.OK:
+        raise from_problem(response)
+    return pb.PredictResponse.FromString(response.content)
+
+
+TRANSPORTS = {"grpc": call_grpc, "rest": call_rest}
+
+
+def from_problem(response: httpx.Response) -> CallError:
+    """The error in a problem+json answer."""
+    assert response.headers["content-type"] == "application/problem+json", response.text
+    problem = response.json()
+    assert problem["status"] == response.status_code
+    retry = response.headers.get("Retry-After")
+    return CallError(
+        problem["code"],
+        problem["detail"],
+        problem["reason"],
+        [(fault["field"], fault["detail"]) for fault in problem["errors"]],
+        None if retry is None else float(retry),
+        response.status_code,
+    )
+
+
+def _from_grpc(error: grpc.aio.AioRpcError) -> CallError:
+    failed = CallError(error.code().name, error.details() or "", "")
+    trailing: Any = error.trailing_metadata() or ()
+    for key, value in trailing:
+        if key != "grpc-status-details-bin":
+            continue
+        status = status_pb2.Status.FromString(value)
+        assert (status.code, status.message) == (error.code().value[0], error.details())
+        for detail in status.details:
+            info = error_details_pb2.ErrorInfo()
+            bad = error_details_pb2.BadRequest()
+            retry = error_details_pb2.RetryInfo()
+            if detail.Unpack(info):
+                assert info.domain == "cab-forecast"
+                failed.reason = info.reason
+            elif detail.Unpack(bad):
+                failed.faults = [(v.field, v.description) for v in bad.field_violations]
+            elif detail.Unpack(retry):
+                failed.retry_after = retry.retry_delay.ToNanoseconds() / 1e9
+    return failed

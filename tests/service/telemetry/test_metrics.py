@@ -1,0 +1,66 @@
+"""What Prometheus reads."""
+
+import httpx
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+
+from service.server import Server
+from tests.service.fakes import FakeForecaster
+from tests.service.requests import CYCLIST, add_agent, make_request
+from tests.service.servers import CallError, call_grpc, call_rest, running
+
+
+async def scrape(server: Server) -> dict[tuple[str, frozenset[str]], float]:
+    async with httpx.AsyncClient() as client:
+        text = (await client.get(f"http://{server.http_address}/metrics")).text
+    return {
+        (sample.name, frozenset(sample.labels.values())): sample.value
+        for family in text_string_to_metric_families(text)
+        for sample in family.samples
+    }
+
+
+async def test_calls_are_counted() -> None:
+    async with running(FakeForecaster()) as server:
+        request = make_request(2)
+        add_agent(request, "bike", CYCLIST)
+        request.agents[1].states[0].x = float("nan")
+        await call_grpc(server, request)
+        await call_rest(server, make_request(1))
+        with pytest.raises(CallError):
+            await call_rest(server, make_request(1, model="nobody"))
+        seen = await scrape(server)
+    assert seen["forecast_requests_total", frozenset({"grpc", "Predict", "OK"})] == 1
+    assert seen["forecast_requests_total", frozenset({"rest", "Predict", "OK"})] == 1
+    assert seen["forecast_requests_total", frozenset({"rest", "Predict", "NOT_FOUND"})] == 1
+    assert seen["forecast_request_duration_seconds_count", frozenset({"rest", "Predict"})] == 2
+    assert seen["forecast_agents_total", frozenset({"fake", "ok"})] == 2
+    assert seen["forecast_agents_total", frozenset({"fake", "invalid"})] == 1
+    assert seen["forecast_agents_total", frozenset({"fake", "fallback"})] == 1
+    assert seen["forecast_batch_agents_sum", frozenset()] == 3
+    assert seen["forecast_queue_seconds_count", frozenset()] == 3
+    assert seen["forecast_inference_seconds_count", frozenset({"fake"})] == 2
+    assert seen["forecast_inference_seconds_count", frozenset({"constant-velocity-yaw"})] == 1
+    assert seen["forecast_queue_agents", frozenset()] == 0
+    assert seen["forecast_model_info", frozenset({"fake", "1.0.0", "causal", "true"})] == 1
+    assert seen["forecast_model_info", frozenset({"kalman", "1.0.0", "causal", "false"})] == 1
+    assert ("process_cpu_seconds_total", frozenset()) in seen
+
+
+async def test_no_ids_in_labels() -> None:
+    async with running() as server:
+        request = make_request(1)
+        request.scene_id = "secret-scene"
+        request.agents[0].id = "secret-agent"
+        await call_grpc(server, request)
+        with pytest.raises(CallError):
+            await call_grpc(server, make_request(1, model="secret-model"))
+        assert "secret" not in server.metrics.render().decode()
+
+
+async def test_servers_do_not_share_metrics() -> None:
+    async with running() as one, running() as other:
+        await call_grpc(one, make_request(1))
+        name, labels = "forecast_requests_total", {"transport": "grpc", "method": "Predict", "code": "OK"}
+        assert one.metrics.registry.get_sample_value(name, labels) == 1
+        assert other.metrics.registry.get_sample_value(name, labels) is None
