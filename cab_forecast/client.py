@@ -6,9 +6,9 @@ from types import TracebackType
 from typing import Self
 
 import tenacity
+
 from cab.forecast.v1.model_service_pb2 import GetModelRequest, ListModelsRequest, Model
 from cab.forecast.v1.prediction_service_pb2 import PredictRequest, PredictResponse
-
 from cab_forecast.endpoints import DEFAULT_ENDPOINT, parse_endpoint
 from cab_forecast.methods import GET_MODEL, LIST_MODELS, PREDICT, Method, Request, Response
 from cab_forecast.timing import RETRY, WAIT, Budget, stop

@@ -6,6 +6,7 @@ from enum import StrEnum
 
 import numpy as np
 import numpy.typing as npt
+
 from cab.forecast.v1.model_service_pb2 import ModelReference
 from cab.forecast.v1.prediction_service_pb2 import AgentForecast, ForecastStatus, PredictResponse
 

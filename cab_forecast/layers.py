@@ -5,8 +5,9 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from cab.forecast.v1.prediction_service_pb2 import LayerImage
 from PIL import Image
+
+from cab.forecast.v1.prediction_service_pb2 import LayerImage
 
 Layers = npt.NDArray[np.bool_]
 ImageEncoding = Literal["packed_bits", "png"]

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from typing import Generic, Literal, TypeVar
 from urllib.parse import quote
 
+from google.protobuf.message import Message
+
 from cab.forecast.v1.model_service_pb2 import (
     GetModelRequest,
     GetModelResponse,
@@ -12,7 +14,6 @@ from cab.forecast.v1.model_service_pb2 import (
     ListModelsResponse,
 )
 from cab.forecast.v1.prediction_service_pb2 import PredictRequest, PredictResponse
-from google.protobuf.message import Message
 
 Request = TypeVar("Request", bound=Message)
 Response = TypeVar("Response", bound=Message)

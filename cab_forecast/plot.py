@@ -16,7 +16,6 @@ except ModuleNotFoundError as error:
     ) from error
 
 from cab.forecast.v1.prediction_service_pb2 import Agent, PredictRequest, PredictResponse
-
 from cab_forecast.forecast import Forecast, Status, forecasts
 from cab_forecast.names import model_name, protocol_name, type_name
 from cab_forecast.plot_agents import (

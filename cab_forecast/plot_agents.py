@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from cab.forecast.v1.prediction_service_pb2 import Agent
 from matplotlib import patheffects
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Ellipse, Polygon
 
+from cab.forecast.v1.prediction_service_pb2 import Agent
 from cab_forecast.forecast import Forecast
 from cab_forecast.names import type_name
 from cab_forecast.plot_style import INK, NOMINAL_RADIUS, NOMINAL_SIZES, TYPE_COLORS, WRONG

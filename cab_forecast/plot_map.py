@@ -2,11 +2,11 @@
 
 import numpy as np
 import numpy.typing as npt
-from cab.forecast.v1.prediction_service_pb2 import Agent, PredictRequest
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
 from matplotlib.transforms import Affine2D
 
+from cab.forecast.v1.prediction_service_pb2 import Agent, PredictRequest
 from cab_forecast.layers import Layers, decode_layers
 from cab_forecast.plot_style import DRIVEABLE, LANE_DIVIDER, ROAD_DIVIDER
 from cab_forecast.requests import PATCH_PIXELS, PIXELS_PER_METER

@@ -10,6 +10,7 @@ from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
+
 from cab.forecast.v1.model_service_pb2 import AgentType
 from cab.forecast.v1.prediction_service_pb2 import (
     CONTEXT_BLIND,
@@ -21,7 +22,6 @@ from cab.forecast.v1.prediction_service_pb2 import (
     PredictRequest,
     SceneRaster,
 )
-
 from cab_forecast.layers import ImageEncoding, as_layers, encode_layers
 
 TypeName = Literal["vehicle", "pedestrian", "cyclist", "unknown"]

@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 
 import numpy as np
-from cab.forecast.v1.prediction_service_pb2 import PredictRequest, PredictResponse
 from rich.console import Console
 from rich.markup import escape
 from rich.measure import Measurement
 from rich.table import Table
 
+from cab.forecast.v1.prediction_service_pb2 import PredictRequest, PredictResponse
 from cab_forecast.forecast import Forecast, Status, forecasts
 from cab_forecast.names import model_name, protocol_name, type_name
 

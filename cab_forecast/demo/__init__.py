@@ -4,7 +4,6 @@ Everything is computed here, the same at every call; there is no data to load an
 """
 
 from cab.forecast.v1.prediction_service_pb2 import PredictRequest
-
 from cab_forecast.demo.crossing import crossing_raster
 from cab_forecast.demo.traffic import NOW, traffic
 from cab_forecast.requests import predict_request

@@ -2,8 +2,8 @@
 
 import numpy as np
 import numpy.typing as npt
-from cab.forecast.v1.prediction_service_pb2 import SceneRaster
 
+from cab.forecast.v1.prediction_service_pb2 import SceneRaster
 from cab_forecast.requests import PIXELS_PER_METER, scene_raster
 
 LANE_WIDTH = 3.5

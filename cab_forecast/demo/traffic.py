@@ -4,8 +4,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from cab.forecast.v1.prediction_service_pb2 import Agent
 
+from cab.forecast.v1.prediction_service_pb2 import Agent
 from cab_forecast.demo.crossing import LANE_WIDTH, LAY_BY_CENTER, STOP_LINE
 from cab_forecast.demo.paths import Motion, Path, Piece
 from cab_forecast.requests import TypeName, agent

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import typer
-from cab.forecast.v1.prediction_service_pb2 import CONTEXT_BLIND, PredictRequest, PredictResponse
 
+from cab.forecast.v1.prediction_service_pb2 import CONTEXT_BLIND, PredictRequest, PredictResponse
 from cab_forecast.client import Client
 from cab_forecast.demo import demo_request
 from cab_forecast.errors import UNREACHABLE, ForecastError, Unauthenticated

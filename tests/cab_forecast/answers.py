@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+
 from cab.forecast.v1.model_service_pb2 import INPUT_PROTOCOL_CAUSAL, ModelReference
 from cab.forecast.v1.prediction_service_pb2 import (
     FORECAST_STATUS_INVALID,

@@ -12,6 +12,11 @@ from typing import Any, TypeVar
 
 import grpc
 import uvicorn
+from google.protobuf import any_pb2, duration_pb2, json_format
+from google.protobuf.message import Message
+from google.rpc import code_pb2, error_details_pb2, status_pb2
+from grpc_status import rpc_status
+
 from cab.forecast.v1.model_service_pb2 import (
     GetModelRequest,
     GetModelResponse,
@@ -25,11 +30,6 @@ from cab.forecast.v1.prediction_service_pb2_grpc import (
     PredictionServiceServicer,
     add_PredictionServiceServicer_to_server,
 )
-from google.protobuf import any_pb2, duration_pb2, json_format
-from google.protobuf.message import Message
-from google.rpc import code_pb2, error_details_pb2, status_pb2
-from grpc_status import rpc_status
-
 from tests.cab_forecast.answers import answer
 
 PROTOBUF, JSON = "application/x-protobuf", "application/json"

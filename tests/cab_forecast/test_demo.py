@@ -6,9 +6,9 @@ import sys
 
 import numpy as np
 import pytest
-from cab.forecast.v1.prediction_service_pb2 import Agent, PredictRequest
 from google.protobuf import json_format
 
+from cab.forecast.v1.prediction_service_pb2 import Agent, PredictRequest
 from cab_forecast import demo_request
 from cab_forecast.demo.crossing import driveable
 from cab_forecast.demo.paths import Motion, Path, Piece

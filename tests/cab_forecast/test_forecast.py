@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from cab.forecast.v1.prediction_service_pb2 import FORECAST_STATUS_INVALID, PredictResponse
 
+from cab.forecast.v1.prediction_service_pb2 import FORECAST_STATUS_INVALID, PredictResponse
 from cab_forecast import Status, demo_request, forecasts
 from tests.cab_forecast.answers import MODEL, TURN_RATES, WEIGHTS, answer
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cab.forecast.v1.prediction_service_pb2 import PredictRequest
 from PIL import Image
 
 import cab_forecast.plot
+from cab.forecast.v1.prediction_service_pb2 import PredictRequest
 from cab_forecast import agent, demo_request, map_patch, predict_request
 from cab_forecast.plot import DOTS_PER_INCH, LONG_SIDE, plot
 from tests.cab_forecast.answers import answer

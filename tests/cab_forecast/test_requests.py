@@ -3,12 +3,12 @@
 import hypothesis.extra.numpy as arrays
 import numpy as np
 import pytest
-from cab.forecast.v1.model_service_pb2 import AGENT_TYPE_CYCLIST, AgentType
-from cab.forecast.v1.prediction_service_pb2 import CONTEXT_BLIND, CONTEXT_FULL, LayerImage, PredictRequest
 from google.protobuf import json_format
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cab.forecast.v1.model_service_pb2 import AGENT_TYPE_CYCLIST, AgentType
+from cab.forecast.v1.prediction_service_pb2 import CONTEXT_BLIND, CONTEXT_FULL, LayerImage, PredictRequest
 from cab_forecast import agent, map_patch, predict_request, scene_raster
 from cab_forecast.layers import Layers, decode_layers, encode_layers
 

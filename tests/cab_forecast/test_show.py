@@ -3,10 +3,10 @@
 import io
 
 import pytest
-from cab.forecast.v1.model_service_pb2 import ModelReference
-from cab.forecast.v1.prediction_service_pb2 import FORECAST_STATUS_FALLBACK, PredictRequest, PredictResponse
 from rich.console import Console
 
+from cab.forecast.v1.model_service_pb2 import ModelReference
+from cab.forecast.v1.prediction_service_pb2 import FORECAST_STATUS_FALLBACK, PredictRequest, PredictResponse
 from cab_forecast import demo_request
 from cab_forecast.show import print_forecasts
 from tests.cab_forecast.answers import answer

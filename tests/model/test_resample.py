@@ -95,7 +95,7 @@ def test_constant_velocity_at_any_rate_and_age_is_exact(
 ) -> None:
     path = straight(velocity, offset)
     states = resample(one(at_rate(hertz, 4, NOW - age), path), NOW, 5)
-    grid = NOW - STEP_SECONDS * np.arange(4, -1, -1)
+    grid = NOW - STEP_SECONDS * np.arange(4, -1, -1, dtype=np.float64)
     assert states.first[0] == 0
     # An observation stands for a grid time that is no further away than the tolerance
     off = TIME_TOLERANCE * float(np.hypot(*velocity)) + 1e-4

@@ -1,0 +1,1 @@
+"""Loads and measurements of a server that runs as users run it."""

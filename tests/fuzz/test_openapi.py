@@ -1,0 +1,72 @@
+"""Generated requests from the OpenAPI document, and answers checked against it."""
+
+import math
+from typing import Any
+
+import httpx
+import pytest
+import schemathesis
+from hypothesis import HealthCheck, given, settings
+from schemathesis.core.result import Ok
+from schemathesis.specs.openapi.checks import (
+    content_type_conformance,
+    response_schema_conformance,
+    status_code_conformance,
+)
+
+from service.server import Server
+
+pytestmark = [
+    pytest.mark.fuzz,
+    pytest.mark.filterwarnings("ignore::DeprecationWarning"),  # schemathesis's own
+    pytest.mark.filterwarnings("ignore:Generating overly large repr"),
+]
+
+
+CASES = settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
+"""For each operation. Plain hypothesis instead of schemathesis's pytest plugin, which pytest 9.2 breaks."""
+
+
+def test_every_operation(server: Server) -> None:
+    document = schemathesis.openapi.from_url(f"http://{server.http_address}/openapi.json")
+    operations = []
+    for result in document.get_all_operations():
+        assert isinstance(result, Ok), result
+        operations.append(result.ok())
+    assert {operation.label for operation in operations} >= {
+        "POST /v1/predict",
+        "GET /v1/models",
+        "GET /v1/models/{name}",
+    }
+    for operation in operations:
+
+        @CASES
+        @given(case=operation.as_strategy())
+        def generated(case: Any) -> None:
+            check(case)
+
+        generated()
+
+
+def check(case: Any) -> None:
+    """Sends a case and checks the answer."""
+    response = case.call()
+    case.validate_response(
+        response,
+        checks=[status_code_conformance, content_type_conformance, response_schema_conformance],
+    )
+    late = response.status_code == httpx.codes.GATEWAY_TIMEOUT and "Request-Timeout" in case.headers
+    assert response.status_code < httpx.codes.INTERNAL_SERVER_ERROR or late, response.text
+    if response.headers.get("content-type", [""])[0] == "application/json":
+        assert finite(response.json())
+
+
+def finite(value: object) -> bool:
+    """Whether no number in a document is NaN or infinite (nor such a string, as protobuf writes them)."""
+    if isinstance(value, dict):
+        return all(map(finite, value.values()))
+    if isinstance(value, list):
+        return all(map(finite, value))
+    if isinstance(value, float):
+        return math.isfinite(value)
+    return value not in {"NaN", "Infinity", "-Infinity"}
