@@ -137,9 +137,7 @@ class Server:
         try:
             await self._grpc.start()
         except OSError as error:
-            raise StartError(
-                f"grpc: cannot listen on {self.settings.grpc} ({error}); is it taken?"
-            ) from error
+            raise StartError(f"grpc: cannot listen on {self.settings.grpc}; is it taken?") from error
         try:
             await self._http.start()
         except OSError as error:

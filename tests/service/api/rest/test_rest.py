@@ -1,5 +1,6 @@
 """REST as HTTP: addresses, media types, headers, limits."""
 
+import re
 from collections.abc import AsyncIterator
 
 import httpx
@@ -75,7 +76,11 @@ async def test_probes(server: Server, client: httpx.AsyncClient) -> None:
 
 
 async def test_docs(client: httpx.AsyncClient) -> None:
-    assert "swagger" in (await client.get("/docs")).text.lower()
+    page = (await client.get("/docs")).text
+    files = re.findall(r'(?:src|href)="([^"]+)"', page)
+    assert any("swagger-ui" in file for file in files)
+    for file in files:  # all of them here: the page needs no internet
+        assert (await client.get(file)).status_code == httpx.codes.OK, file
     assert (await client.get("/openapi.json")).json()["info"]["title"] == "cab-forecast"
 
 
