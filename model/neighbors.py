@@ -3,8 +3,9 @@
 import numpy as np
 
 from model.arrays import Floats, Ints
+from model.geometry import wrap_angle
 from model.scene import AgentStates, AgentType
-from model.standardization import ATTENTION_RADIUS, STATE_SIZE, state_scale, state_vectors
+from model.standardization import ATTENTION_RADIUS, HEADING, STATE_SIZE, state_scale, state_vectors
 
 _RAMP = np.array([0.25, 0.5, 0.75, 1.0])
 """Weights of presence now, 0.5 s ago, … 1.5 s ago: an edge fades in (Trajectron++, section 4.1)."""
@@ -44,9 +45,10 @@ def neighbor_sums(
 ) -> Floats:
     """Sum of the connected neighbours' standardised histories: [n, F, STATE_SIZE[other]].
 
-    Relative to the target's state now in the dimensions that both types have. What was not observed of
-    a neighbour counts as zero after standardisation, so that the sum does not depend on where the
-    ground frame's origin is.
+    Relative to the target's state now in the dimensions that both types have, headings by the shorter
+    arc. What was not observed of a neighbour counts as zero after standardisation. So the sum does not
+    depend on where the ground frame's origin is, nor its heading on the frame's direction. (The reference
+    has zeros before standardisation and plain differences of headings.)
 
     Args:
         states: of all agents of the scene.
@@ -66,5 +68,9 @@ def neighbor_sums(
     # Σ_j c_ij (h_j − s_i), without an [n, m, F, D] array
     total = np.tensordot(connected, np.where(known, history, 0.0), axes=1)
     counted = np.tensordot(connected, known.astype(np.float64), axes=1)
-    result: Floats = (total - counted * present) / state_scale(own, other)
-    return result
+    sums: Floats = total - counted * present
+    if common > HEADING:  # angles do not subtract like lengths
+        difference = wrap_angle(history[None, ..., HEADING] - present[..., HEADING][:, None])
+        sums[..., HEADING] = np.einsum("nm,nmf->nf", connected, np.nan_to_num(difference))
+    sums /= state_scale(own, other)
+    return sums

@@ -12,6 +12,9 @@ from model.scene import AgentStates, AgentType
 STATE_SIZE = {AgentType.VEHICLE: 8, AgentType.PEDESTRIAN: 6}
 """Length of a type's state vector; types that are not here have no network."""
 
+HEADING = 6
+"""Where a state vector has its heading, if it has one."""
+
 ATTENTION_RADIUS = {
     (AgentType.VEHICLE, AgentType.VEHICLE): 30.0,
     (AgentType.VEHICLE, AgentType.PEDESTRIAN): 20.0,
@@ -39,6 +42,6 @@ def state_scale(own: AgentType, of: AgentType) -> Floats:
 def state_vectors(states: AgentStates, kind: AgentType) -> Floats:
     """[N, F, STATE_SIZE[kind]] float64, NaN where not observed (and for a heading that is unknown)."""
     parts = [states.position, states.velocity, states.acceleration]
-    if STATE_SIZE[kind] > 6:
+    if STATE_SIZE[kind] > HEADING:
         parts += [states.heading[..., None], states.heading_rate[..., None]]
     return np.concatenate(parts, axis=-1)

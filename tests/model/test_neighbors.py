@@ -6,9 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from model.arrays import Floats
+from model.geometry import rotate, wrap_angle
 from model.neighbors import edge_ramps, neighbor_sums
 from model.scene import AgentStates, AgentType
-from model.standardization import ATTENTION_RADIUS, state_scale, state_vectors
+from model.standardization import ATTENTION_RADIUS, HEADING, state_scale, state_vectors
 
 VEHICLE, PEDESTRIAN = AgentType.VEHICLE, AgentType.PEDESTRIAN
 FRAMES = 5
@@ -103,6 +104,8 @@ def test_sums_are_the_sum_over_neighbours_wherever_the_origin_is(
             relative = state_vectors(near, other)[j]
             common = min(relative.shape[1], len(now))
             relative[:, :common] -= now[:common]
+            if common > HEADING:
+                relative[:, HEADING] = wrap_angle(relative[:, HEADING])
             expected += np.nan_to_num(relative / state_scale(own, other))
     for s in (near, far):
         sums = neighbor_sums(s, targets, own, neighbors, other, edges)
@@ -115,3 +118,24 @@ def test_no_neighbours_sum_to_zero() -> None:
     edges = edge_ramps(s, np.array([0]), VEHICLE, none, VEHICLE)
     assert edges.shape == (1, 0)
     assert not neighbor_sums(s, np.array([0]), VEHICLE, none, VEHICLE, edges).any()
+
+
+@given(st.floats(-7, 7))
+def test_turning_the_frame_turns_positions_and_keeps_relative_headings(angle: float) -> None:
+    rng = np.random.default_rng(3)
+    plain = states(rng.uniform(-9, 9, (4, FRAMES, 2)))
+    vectors = [plain.position, plain.velocity, plain.acceleration]
+    position, velocity, acceleration = (rotate(values, np.array(angle)) for values in vectors)
+    heading = wrap_angle(plain.heading + angle)
+    turned = AgentStates(position, velocity, acceleration, heading, plain.heading_rate, plain.first)
+    targets, others = np.array([0]), np.arange(1, 4)
+    sums = []
+    for s in (plain, turned):
+        edges = edge_ramps(s, targets, VEHICLE, others, VEHICLE)
+        sums.append(neighbor_sums(s, targets, VEHICLE, others, VEHICLE, edges)[0])
+    for at in (0, 2, 4):
+        expected = rotate(sums[0][:, at : at + 2], np.array(angle))
+        np.testing.assert_allclose(sums[1][:, at : at + 2], expected, atol=1e-9)
+    np.testing.assert_allclose(sums[1][:, 7], sums[0][:, 7], atol=1e-9)
+    # By the shorter arc: alike unless a difference is just half a turn, where either way is right
+    assert (np.abs(sums[1][:, HEADING] - sums[0][:, HEADING]) < 1e-9).all()
