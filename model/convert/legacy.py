@@ -13,13 +13,17 @@ import numpy as np
 
 from model.arrays import Float32s
 from model.convert.errors import ConversionError
-from model.convert.unpickling import TORCH_MODULES, InertModule, StorageRef, TensorRef, unpickle
+from model.convert.inert import TORCH_MODULES, InertModule, TensorRef, is_name
+from model.convert.unpickling import unpickle
 
 MAX_FILE_BYTES = 1 << 29
 """Larger files are refused (Trajectron++ takes 1.3 MB)."""
 MAX_DEPTH = 16
 """Modules within modules."""
 MAX_MODULES = 10_000
+"""In a tree (Trajectron++: 51)."""
+MAX_PARAMETERS = 10_000
+"""In a tree, those that are None included (Trajectron++: 110)."""
 
 _MAGIC = 0x1950A86A20F9469CFC6C
 _FORMAT_VERSION = 1001
@@ -36,7 +40,7 @@ def read_parameters(file: Path) -> dict[str, Float32s]:
         Arrays by name, as ``state_dict`` would name them.
 
     Raises:
-        UnsafePickleError: it names something that is not known to be harmless; nothing was run.
+        UnsafePickleError: it names or does something that is not known to be harmless; nothing was run.
         ConversionError: it is not such a file, or damaged.
     """
     try:
@@ -51,7 +55,8 @@ def _load(file: Path) -> io.BytesIO:
     size = file.stat().st_size
     if size > MAX_FILE_BYTES:
         raise ConversionError(f"{size} bytes are too many; at most {MAX_FILE_BYTES} are read")
-    data = file.read_bytes()
+    with file.open("rb") as handle:
+        data = handle.read(size)  # and no more, whatever has happened to the file
     if data.startswith(_ZIP_MAGIC):
         raise ConversionError(
             "this is a zip archive, the format of torch since 1.6; only legacy files are read "
@@ -85,17 +90,19 @@ def _parameters(stream: io.BytesIO) -> dict[str, Float32s]:
 def _storages(stream: io.BytesIO) -> Mapping[str, Float32s]:
     """The storages behind the object, by key."""
     keys = unpickle(stream, {})
-    if not isinstance(keys, list) or not all(isinstance(key, str) for key in keys):
+    if not isinstance(keys, list) or not all(map(is_name, keys)):
         raise ConversionError("the list of storages is damaged")
     rest = stream.getbuffer()[stream.tell() :]
     storages: dict[str, Float32s] = {}
     for key in keys:
+        if key in storages:
+            raise ConversionError(f"storage {key} is listed twice")
         count = int.from_bytes(rest[:8], "little", signed=True)
         if len(rest) < 8 or not 0 <= 4 * count <= len(rest) - 8:
             raise ConversionError(f"storage {key} wants {count} numbers, but the file ends before")
         storages[key] = np.frombuffer(rest[8 : 8 + 4 * count], dtype="<f4")
         rest = rest[8 + 4 * count :]
-    if len(rest) or len(storages) != len(keys):
+    if len(rest):
         raise ConversionError("the storages do not add up to the file")
     return storages
 
@@ -103,43 +110,52 @@ def _storages(stream: io.BytesIO) -> Mapping[str, Float32s]:
 def _walk(root: object) -> Iterator[tuple[str, object]]:
     """Names and tensor references of all parameters of a module tree, in its order."""
     pending: list[tuple[tuple[str, ...], object]] = [((), root)]
-    visited = 0
+    modules: set[InertModule] = set()
+    parameters = 0
     while pending:
         path, module = pending.pop()
-        visited += 1
         if not isinstance(module, InertModule):
-            raise ConversionError(f"{'.'.join(path) or 'the object'} is not a module")
-        if len(path) > MAX_DEPTH or visited > MAX_MODULES:
-            raise ConversionError("the tree of modules is too large")
-        if _part(module, path, "_buffers"):
-            raise ConversionError(f"{'.'.join(path)} has buffers, which no network here has")
-        for name, parameter in _part(module, path, "_parameters").items():
+            raise ConversionError(f"{_told(path)} is not a module")
+        if module in modules:  # a small file could name it as often as it likes
+            raise ConversionError(f"the tree of modules is too large, or none: {_told(path)} is in it twice")
+        modules.add(module)
+        if len(path) > MAX_DEPTH:
+            raise ConversionError(f"the tree of modules is too large: more than {MAX_DEPTH} deep")
+        if _part(module, path, "_buffers", MAX_PARAMETERS):
+            raise ConversionError(f"{_told(path)} has buffers, which no network here has")
+        own = _part(module, path, "_parameters", MAX_PARAMETERS - parameters)
+        parameters += len(own)
+        for name, parameter in own.items():
             if parameter is not None:
                 yield ".".join((*path, name)), parameter
-        pending.extend(((*path, name), child) for name, child in _part(module, path, "_modules").items())
+        children = _part(module, path, "_modules", MAX_MODULES - len(modules) - len(pending))
+        pending.extend(((*path, name), child) for name, child in children.items())
 
 
-def _part(module: InertModule, path: tuple[str, ...], name: str) -> dict[str, object]:
+def _part(module: InertModule, path: tuple[str, ...], name: str, limit: int) -> dict[str, object]:
     part = module.state.get(name, {})
-    if not isinstance(part, dict) or not all(isinstance(key, str) for key in part):
-        raise ConversionError(f"{name} of {'.'.join(path) or 'the object'} is damaged")
+    if not isinstance(part, dict):
+        raise ConversionError(f"{name} of {_told(path)} is damaged")
+    if len(part) > limit:
+        raise ConversionError(f"the tree of modules is too large: {len(part)} {name} in {_told(path)}")
+    if not all(key and "." not in key for key in part):
+        raise ConversionError(f"{name} of {_told(path)} is damaged: a name is empty, or has a dot in it")
     return part
+
+
+def _told(path: tuple[str, ...]) -> str:
+    return ".".join(path) or "the object"
 
 
 def _tensor(name: str, reference: object, storages: Mapping[str, Float32s]) -> Float32s:
     """A read-only view of a storage; numpy checks that shape and strides stay within it."""
-    match reference:
-        case TensorRef(
-            StorageRef(str() as key, int() as count), int() as offset, tuple() as size, tuple() as stride
-        ):
-            pass
-        case _:
-            raise ConversionError(f"{name} is not a tensor")
+    if not isinstance(reference, TensorRef):
+        raise ConversionError(f"{name} is not a tensor")
+    (key, count), offset, size, stride = reference
     storage = storages.get(key)
     if storage is None or len(storage) != count:
         raise ConversionError(f"the storage of {name} is missing, or not of {count} numbers")
-    numbers = (offset, *size, *stride)
-    if len(size) != len(stride) or not all(type(n) is int and 0 <= n <= count for n in numbers):
+    if len(size) != len(stride) or not all(0 <= number <= count for number in (offset, *size, *stride)):
         raise ConversionError(f"the shape of {name} is out of bounds")
     try:
         return np.ndarray(

@@ -74,7 +74,7 @@ def rename(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """
     renamed: dict[str, Tensor] = {}
     for name, tensor in tensors.items():
-        ours = _our_name(name)
+        ours = our_name(name)
         if ours is None:
             continue
         if ours in renamed:
@@ -83,7 +83,7 @@ def rename(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return renamed
 
 
-def _our_name(name: str) -> str | None:
+def our_name(name: str) -> str | None:
     """Ours for theirs; None for what is unused."""
     module, _, parameter = name.rpartition(".")
     if edge := _EDGE.fullmatch(module):

@@ -1,93 +1,40 @@
 """Pickles of torch modules, read without running anything that they name.
 
-A pickle is a program: it may name any function and call it. Here every name is looked up in a short list,
-and stands for something inert; any other name ends the reading before the pickle can use it.
+A pickle is a program for a stack machine, and Python's own machine can be made to call anything. This one
+knows only the opcodes that torch's legacy writer uses, and has only plain values to build from: scalars,
+short tuples, lists, dictionaries with strings as keys, stand-ins of modules and tensors. Nothing is copied,
+and nothing but short strings is hashed; so time and memory grow with the number of opcodes, which is limited.
 """
 
 import io
-import pickle
-import pickletools
-from collections.abc import Mapping
-from typing import NamedTuple, NoReturn, Self
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Final
 
-from model.convert.errors import ConversionError, UnsafePickleError
-
-MAX_MEMO = 1 << 20
-"""Largest index into the pickle's memo; Python sets memory aside for all smaller ones."""
-_EXTENSIONS = frozenset({"EXT1", "EXT2", "EXT4"})
-
-
-class StorageRef(NamedTuple):
-    """Where a tensor's numbers lie: in the storage of that key, which follows the pickle."""
-
-    key: object
-    length: object
-
-
-class TensorRef(NamedTuple):
-    """A tensor as the pickle describes it; of its fields nothing is known to be true."""
-
-    storage: object
-    offset: object
-    size: object
-    stride: object
-
-
-class InertModule:
-    """Stands for any ``nn.Module``: keeps its state, does nothing."""
-
-    __slots__ = ("state",)
-
-    state: Mapping[object, object]
-
-    def __new__(cls) -> Self:
-        """Not ``__init__``: unpickling does without that."""
-        self = super().__new__(cls)
-        self.state = {}
-        return self
-
-    def __setstate__(self, state: object) -> None:
-        if not isinstance(state, dict):
-            raise ConversionError("a module's state is not a dictionary")
-        self.state = state
-
-
-class FloatStorage:
-    """Stands for ``torch.FloatStorage``: only its name counts."""
-
-
-def _rebuild_tensor(
-    storage: object, offset: object, size: object, stride: object, _requires_grad: object, _hooks: object
-) -> TensorRef:
-    return TensorRef(storage, offset, size, stride)
-
-
-def _rebuild_parameter(data: object, _requires_grad: object, _hooks: object) -> object:
-    return data
-
-
-_MODULE_CLASSES = (
-    "model.components.additive_attention AdditiveAttention",
-    "model.components.map_encoder CNNMapEncoder",
-    "torch.nn.modules.container ModuleDict",
-    "torch.nn.modules.container ModuleList",
-    "torch.nn.modules.container Sequential",
-    "torch.nn.modules.conv Conv2d",
-    "torch.nn.modules.linear Linear",
-    "torch.nn.modules.rnn GRUCell",
-    "torch.nn.modules.rnn LSTM",
+from model.convert.errors import ConversionError
+from model.convert.inert import (
+    TORCH_MODULES,
+    InertModule,
+    Meaning,
+    StorageRef,
+    TensorRef,
+    build,
+    is_name,
+    refer,
 )
-TORCH_MODULES: Mapping[str, object] = {
-    "collections OrderedDict": dict,
-    "torch FloatStorage": FloatStorage,
-    "torch._utils _rebuild_parameter": _rebuild_parameter,
-    "torch._utils _rebuild_tensor_v2": _rebuild_tensor,
-    **dict.fromkeys(_MODULE_CLASSES, InertModule),
-}
-"""What a Trajectron++ checkpoint names, and what each name stands for here."""
+from model.convert.opcodes import Opcode, at, check_opcodes, read_opcodes
+
+__all__ = ["TORCH_MODULES", "InertModule", "StorageRef", "TensorRef", "unpickle"]
+
+MAX_MARKS = 256
+"""Groups within groups (Trajectron++: 10)."""
+MAX_TUPLE_ITEMS = 128
+MAX_INT_BITS = 80
+"""Torch's magic number has 77."""
+
+_PROTOCOL = 2
 
 
-def unpickle(stream: io.BytesIO, names: Mapping[str, object]) -> object:
+def unpickle(stream: io.BytesIO, names: Mapping[str, Meaning]) -> object:
     """The next pickle of a stream, which is left at the pickle's end.
 
     Args:
@@ -95,58 +42,185 @@ def unpickle(stream: io.BytesIO, names: Mapping[str, object]) -> object:
         names: what the pickle may name, as "module name", and what each stands for.
 
     Raises:
-        UnsafePickleError: it names anything else.
-        ConversionError: it is no whole pickle, or not of such objects.
+        UnsafePickleError: it names anything else, or does anything that torch's writer does not.
+        ConversionError: it is no whole pickle, too large, or not of such objects.
     """
-    start = stream.tell()
-    _scan(stream)
-    end = stream.tell()
-    program = stream.getbuffer()[start:end]
-    try:
-        return _Unpickler(io.BytesIO(program), names).load()
-    except ConversionError:
-        raise
-    except Exception as error:  # a damaged pickle can raise nearly anything
-        raise ConversionError(f"the pickle at byte {start} is damaged: {error}") from error
+    opcodes = read_opcodes(stream)
+    check_opcodes(opcodes, _STEPS, names)
+    return _Machine(names).run(opcodes)
 
 
-def _scan(stream: io.BytesIO) -> None:
-    """Reads over a pickle without running it, and refuses what the unpickler itself would not look at."""
-    start = stream.tell()
-    try:
-        for opcode, argument, position in pickletools.genops(stream):
-            if opcode.name in _EXTENSIONS:
-                # Code numbers stand for names of the process's own registry, and may skip find_class
-                raise UnsafePickleError(f"the pickle names extension code {argument} (at byte {position})")
-            if opcode.name.endswith("PUT") and int(argument or 0) > MAX_MEMO:
-                raise ConversionError(f"the pickle at byte {start} wants a memo of {argument} entries")
-    except ConversionError:
-        raise
-    except Exception as error:  # likewise
-        raise ConversionError(f"no whole pickle at byte {start}: {error}") from error
-
-
-class _Unpickler(pickle.Unpickler):
-    def __init__(self, stream: io.BytesIO, names: Mapping[str, object]) -> None:
-        super().__init__(stream)
+class _Machine:
+    def __init__(self, names: Mapping[str, Meaning]) -> None:
         self._names = names
+        self._stack: list[object] = []
+        self._marks: list[int] = []
+        self._memo: dict[int, object] = {}
 
-    def find_class(self, module: str, name: str, /) -> object:
-        """The inert stand-in of a name; called for every name in a pickle, however it is spelled."""
-        try:
-            return self._names[f"{module} {name}"]
-        except KeyError:
-            raise UnsafePickleError(f"the pickle names {module}.{name}, which is not allowed") from None
+    def run(self, opcodes: Iterable[Opcode]) -> object:
+        for opcode in opcodes:
+            try:
+                _STEPS[opcode.name](self, opcode.argument)
+            except ConversionError as error:
+                raise type(error)(f"{error} ({at(opcode)})") from None
+        return self._stack[0]
 
-    def persistent_load(self, pid: object, /) -> object:
-        """Torch's two kinds of outside objects: classes with their source code, and storages."""
-        match pid:
-            case ("module", type() as module, str(), str()):
-                return module
-            case ("storage", storage, str() as key, str(), int() as length, None) if storage is FloatStorage:
-                return StorageRef(key, length)
-        _refuse_reference()
+    def stop(self, _: object) -> None:
+        if len(self._stack) != 1 or self._marks:
+            raise ConversionError("the pickle ends with something other than one object")
+
+    def protocol(self, version: int) -> None:
+        if version != _PROTOCOL:
+            raise ConversionError(f"the pickle is of protocol {version}; torch's files are of {_PROTOCOL}")
+
+    def push(self, value: object) -> None:
+        self._stack.append(value)
+
+    def push_int(self, value: int) -> None:
+        if value.bit_length() > MAX_INT_BITS:
+            raise ConversionError(f"a number has more than {MAX_INT_BITS} bits")
+        self.push(value)
+
+    def push_name(self, name: str) -> None:
+        self.push(self._names[name])
+
+    def put(self, index: int) -> None:
+        self._memo[index] = self._top()
+
+    def get(self, index: int) -> None:
+        if index not in self._memo:
+            raise ConversionError(f"nothing is in the memo at {index}")
+        self.push(self._memo[index])
+
+    def mark(self, _: object) -> None:
+        if len(self._marks) == MAX_MARKS:
+            raise ConversionError(f"more than {MAX_MARKS} groups lie within each other")
+        self._marks.append(len(self._stack))
+
+    def tuple_of(self, count: int) -> None:
+        self._push_tuple([self._pop() for _ in range(count)][::-1])
+
+    def tuple_of_group(self, _: object) -> None:
+        self._push_tuple(self._pop_group())
+
+    def append(self, _: object) -> None:
+        self._extend_list([self._pop()])
+
+    def append_group(self, _: object) -> None:
+        self._extend_list(self._pop_group())
+
+    def set_item(self, _: object) -> None:
+        value = self._pop()
+        self._update_dict([self._pop(), value])
+
+    def set_items_of_group(self, _: object) -> None:
+        self._update_dict(self._pop_group())
+
+    def new_object(self, _: object) -> None:
+        arguments, cls = self._pop_arguments(), self._pop()
+        if cls is not InertModule or arguments:
+            raise ConversionError("only modules are made, without arguments")
+        self.push(InertModule())
+
+    def set_state(self, _: object) -> None:
+        state, module = self._pop(), self._top()
+        if type(module) is not InertModule or module.state:
+            raise ConversionError("only a module has a state, and only one")
+        if type(state) is not dict:
+            raise ConversionError("a module's state is not a dictionary")
+        module.state = state
+
+    def reduce(self, _: object) -> None:
+        arguments, function = self._pop_arguments(), self._pop()
+        self.push(build(function, arguments))
+
+    def refer(self, _: object) -> None:
+        self.push(refer(self._pop()))
+
+    def _top(self) -> object:
+        if len(self._stack) == (self._marks[-1] if self._marks else 0):
+            raise ConversionError("the pickle takes from an empty stack")
+        return self._stack[-1]
+
+    def _pop(self) -> object:
+        top = self._top()
+        del self._stack[-1]
+        return top
+
+    def _pop_arguments(self) -> tuple[object, ...]:
+        arguments = self._pop()
+        if type(arguments) is not tuple:
+            raise ConversionError("arguments are not a tuple")
+        return arguments
+
+    def _pop_group(self) -> list[object]:
+        if not self._marks:
+            raise ConversionError("a group ends that was not begun")
+        start = self._marks.pop()
+        group = self._stack[start:]
+        del self._stack[start:]
+        return group
+
+    def _push_tuple(self, items: Sequence[object]) -> None:
+        if len(items) > MAX_TUPLE_ITEMS:
+            raise ConversionError(f"a tuple has more than {MAX_TUPLE_ITEMS} items")
+        if any(type(part) is tuple for item in items if type(item) is tuple for part in item):
+            raise ConversionError("a tuple of tuples lies within a tuple")
+        self.push(tuple(items))
+
+    def _extend_list(self, items: Iterable[object]) -> None:
+        target = self._top()
+        if type(target) is not list:
+            raise ConversionError("only a list can be appended to")
+        target.extend(items)
+
+    def _update_dict(self, items: Sequence[object]) -> None:
+        target = self._top()
+        if type(target) is not dict:
+            raise ConversionError("only a dictionary has items to set")
+        if len(items) % 2:
+            raise ConversionError("a key has no value")
+        for key, value in zip(items[::2], items[1::2], strict=True):
+            if not is_name(key):
+                raise ConversionError("a key of a dictionary is not a short printable string")
+            target[key] = value
 
 
-def _refuse_reference() -> NoReturn:
-    raise ConversionError("the pickle refers to something that is neither a class nor a float32 storage")
+_Step = Callable[[_Machine, Any], None]
+
+_STEPS: Final[Mapping[str, _Step]] = {
+    "PROTO": _Machine.protocol,
+    "STOP": _Machine.stop,
+    "NONE": lambda machine, _: machine.push(None),
+    "NEWTRUE": lambda machine, _: machine.push(True),
+    "NEWFALSE": lambda machine, _: machine.push(False),
+    "BININT": _Machine.push_int,
+    "BININT1": _Machine.push_int,
+    "BININT2": _Machine.push_int,
+    "LONG1": _Machine.push_int,
+    "LONG4": _Machine.push_int,
+    "BINFLOAT": _Machine.push,
+    "BINUNICODE": _Machine.push,
+    "GLOBAL": _Machine.push_name,
+    "BINPUT": _Machine.put,
+    "LONG_BINPUT": _Machine.put,
+    "BINGET": _Machine.get,
+    "LONG_BINGET": _Machine.get,
+    "MARK": _Machine.mark,
+    "EMPTY_TUPLE": lambda machine, _: machine.tuple_of(0),
+    "TUPLE1": lambda machine, _: machine.tuple_of(1),
+    "TUPLE2": lambda machine, _: machine.tuple_of(2),
+    "TUPLE3": lambda machine, _: machine.tuple_of(3),
+    "TUPLE": _Machine.tuple_of_group,
+    "EMPTY_LIST": lambda machine, _: machine.push([]),
+    "APPEND": _Machine.append,
+    "APPENDS": _Machine.append_group,
+    "EMPTY_DICT": lambda machine, _: machine.push({}),
+    "SETITEM": _Machine.set_item,
+    "SETITEMS": _Machine.set_items_of_group,
+    "NEWOBJ": _Machine.new_object,
+    "BUILD": _Machine.set_state,
+    "REDUCE": _Machine.reduce,
+    "BINPERSID": _Machine.refer,
+}
+"""All that a pickle may do, by opcode."""

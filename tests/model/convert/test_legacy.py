@@ -1,3 +1,5 @@
+import hashlib
+import pickle
 import struct
 from pathlib import Path
 
@@ -168,3 +170,51 @@ def test_a_module_that_holds_itself(tmp_path: Path) -> None:
     head = named("torch.nn.modules.linear", "Linear") + b")\x81q\x00"
     body = head + mapping({"_modules": mapping({"self": b"h\x00"})}) + b"b"
     assert "too large" in _fault(tmp_path, legacy_file(body))
+
+
+def test_a_module_that_is_there_twice(tmp_path: Path) -> None:
+    body = module(modules={"a": module() + b"q\x00", "b": b"h\x00"})
+    assert "a is in it twice" in _fault(tmp_path, legacy_file(body))
+
+
+def test_the_number_of_modules_and_parameters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(legacy, "MAX_MODULES", 4)
+    monkeypatch.setattr(legacy, "MAX_PARAMETERS", 2)
+    one = module({"nothing": b"N"})
+    assert (
+        read_parameters(_write(tmp_path, legacy_file(module(modules={"a": one, "b": module(), "c": one}))))
+        == {}
+    )
+    assert "too large: 1 _parameters in a" in _fault(
+        tmp_path, legacy_file(module(modules={"a": one, "b": one, "c": one}))
+    )
+    assert "too large: 4 _modules in the object" in _fault(
+        tmp_path, legacy_file(module(modules=dict.fromkeys("abcd", module())))
+    )
+    inner = module(modules=dict.fromkeys("ab", module()))
+    assert "too large: 2 _modules in b" in _fault(
+        tmp_path, legacy_file(module(modules={"a": inner, "b": inner}))
+    )
+
+
+@pytest.mark.parametrize("name", ["", "a.b"])
+def test_names_that_could_be_those_of_others(tmp_path: Path, name: str) -> None:
+    assert "a dot in it" in _fault(tmp_path, legacy_file(module(modules={name: module()})))
+    assert "a dot in it" in _fault(tmp_path, legacy_file(module({name: b"N"})))
+
+
+def test_storages_listed_twice_or_by_something_else(tmp_path: Path) -> None:
+    empty = legacy_file(module())
+    head = empty[: -len(pickle.dumps([], protocol=2))]
+    assert "storage k is listed twice" in _fault(tmp_path, head + pickle.dumps(["k", "k"], 2) + bytes(16))
+    for keys in ("k", [1], ["k" * 200], ["\x1b"]):
+        assert "list of storages is damaged" in _fault(tmp_path, head + pickle.dumps(keys, 2) + bytes(16))
+
+
+def test_the_published_file_bit_by_bit(shared: Path) -> None:
+    parameters = read_parameters(shared / "reference/weights/trajectron_int_ee_me/model_registrar-12.pt")
+    digest = hashlib.sha256()
+    for name, array in parameters.items():
+        digest.update(f"{name} {array.shape}".encode())
+        digest.update(array.tobytes())
+    assert digest.hexdigest() == "a67b67f0fe84dbd772d30dc6ad837bd2ad41ebb86cd3d7581ffc6b64f28db10b"

@@ -10,12 +10,44 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from model.convert.errors import ConversionError, UnsafePickleError
-from model.convert.unpickling import TORCH_MODULES, InertModule, StorageRef, unpickle
-from tests.model.convert.assembler import call, group, module, named, number, program, storage, text
+from model.convert.inert import MAX_NAME_LENGTH, Named, TensorRef
+from model.convert.unpickling import (
+    MAX_INT_BITS,
+    MAX_MARKS,
+    MAX_TUPLE_ITEMS,
+    TORCH_MODULES,
+    InertModule,
+    StorageRef,
+    unpickle,
+)
+from tests.model.convert.assembler import (
+    call,
+    group,
+    mapping,
+    module,
+    named,
+    number,
+    program,
+    storage,
+    tensor,
+    text,
+)
+
+LINEAR = named("torch.nn.modules.linear", "Linear")
+ORDERED_DICT = named("collections", "OrderedDict")
+REBUILD = named("torch._utils", "_rebuild_tensor_v2")
+REBUILD_PARAMETER = named("torch._utils", "_rebuild_parameter")
+FLOAT_STORAGE = named("torch", "FloatStorage")
 
 
 def _read(data: bytes) -> object:
     return unpickle(io.BytesIO(data), TORCH_MODULES)
+
+
+def _fault(body: bytes) -> str:
+    with pytest.raises(ConversionError) as caught:
+        _read(program(body))
+    return str(caught.value)
 
 
 class _Bomb:
@@ -179,3 +211,156 @@ def test_only_the_first_pickle_of_a_stream_is_read() -> None:
     assert unpickle(stream, {}) == 1
     assert unpickle(stream, {}) == "two"
     assert stream.read() == b"rest"
+
+
+def test_an_ordered_dictionary_is_made_empty_and_filled() -> None:
+    assert _read(program(ORDERED_DICT + b")R(" + text("a") + b"\x88" + text("b") + b"Nu")) == {
+        "a": True,
+        "b": None,
+    }
+
+
+def test_values() -> None:
+    value = {
+        "a": [1, -2, 70_000, 1.5, "é", None, True, False],
+        "b": (),
+        "c": (1,),
+        "d": ((1, 2), (3, 4, 5, 6)),
+    }
+    assert _read(pickle.dumps(value, 2)) == value
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        REBUILD,
+        REBUILD_PARAMETER,
+        FLOAT_STORAGE,
+        ORDERED_DICT,
+        LINEAR,
+        b"}",
+        b"]",
+        b")",
+        text("a"),
+        storage("k", 3),
+        tensor(storage("k", 3), (3,), (1,)),
+    ],
+)
+@pytest.mark.parametrize("slots", [False, True])
+def test_nothing_but_a_module_has_a_state(target: bytes, slots: bool) -> None:
+    attributes = mapping({"__defaults__": group(), "marks": text("a"), "state": b"N"})
+    before = [dict(vars(thing)) for thing in (InertModule, Named, *Named, StorageRef, TensorRef, unpickle)]
+    state = b"N" + attributes + b"\x86" if slots else attributes
+    assert "BUILD at byte" in _fault(target + state + b"b")
+    assert before == [
+        dict(vars(thing)) for thing in (InertModule, Named, *Named, StorageRef, TensorRef, unpickle)
+    ]
+
+
+def test_a_modules_state_is_one_dictionary_without_slots() -> None:
+    state = mapping({"training": b"\x88"})
+    assert "not a dictionary" in _fault(LINEAR + b")\x81N" + state + b"\x86b")
+    assert "only one" in _fault(LINEAR + b")\x81" + state + b"b" + state + b"b")
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        call(ORDERED_DICT, b"}"),
+        call(ORDERED_DICT, b"]"),
+        call(FLOAT_STORAGE),
+        call(LINEAR),
+        call(text("eval"), text("1")),
+        call(b"}"),
+    ],
+)
+def test_only_the_builders_are_called(body: bytes) -> None:
+    with pytest.raises(UnsafePickleError, match="REDUCE at byte"):
+        _read(program(body))
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        call(REBUILD),
+        call(REBUILD, storage("k", 3), number(0), group(number(3)), group(number(1)), b"\x89"),
+        call(REBUILD, storage("k", 3), b"\x88", group(number(3)), group(number(1)), b"\x89", b"}"),
+        call(REBUILD, storage("k", 3), number(0), group(b"N"), group(number(1)), b"\x89", b"}"),
+        call(REBUILD, storage("k", 3), number(0), b"]", b"]", b"\x89", b"}"),
+        call(REBUILD, storage("k", 3), number(0), b")", b")", b"\x89", mapping({"hook": b"N"})),
+        call(REBUILD_PARAMETER, storage("k", 3), b"\x88", b"}"),
+        call(REBUILD_PARAMETER, b"N", b"\x88", b"}"),
+    ],
+)
+def test_tensors_are_built_of_what_torch_writes(body: bytes) -> None:
+    fault = _fault(body)
+    assert "is not a tensor" in fault
+    assert "REDUCE at byte" in fault
+
+
+@pytest.mark.parametrize(
+    "key", [b"N", b"\x88", number(1), b")", b"G" + bytes(8), storage("k", 3), LINEAR, text("\x1b")]
+)
+def test_keys_are_short_printable_strings(key: bytes) -> None:
+    assert "SETITEM at byte" in _fault(b"}" + key + b"Ns")
+    assert "SETITEMS at byte" in _fault(b"}(" + key + b"Nu")
+
+
+def test_the_longest_key() -> None:
+    assert "not a short" in _fault(b"}" + text("a" * (MAX_NAME_LENGTH + 1)) + b"Ns")
+    assert _read(program(b"}" + text("a" * MAX_NAME_LENGTH) + b"Ns"))
+
+
+@pytest.mark.parametrize(
+    ("body", "told"),
+    [
+        (b"]" + b"(" * MAX_MARKS + b"(", "groups lie within each other (MARK at byte"),
+        (b"(" + b"N" * (MAX_TUPLE_ITEMS + 1) + b"t", "items (TUPLE at byte"),
+        (b"N\x85\x85\x85", "within a tuple (TUPLE1 at byte 5)"),
+        (number(2**64) + b"\x8a\x0b" + bytes(10) + b"\x01", "bits (LONG1 at byte"),
+        (b"]N(e", "only a list can be appended to"),
+        (b"}NNa", "only a list can be appended to"),
+        (b"]NNs", "only a dictionary has items"),
+        (b"}(Nu", "a key has no value"),
+        (b"}e", "that was not begun"),
+        (b"N(\x85t", "an empty stack"),
+        (b"N(q\x00t", "an empty stack"),
+        (b"h\x07", "nothing is in the memo at 7"),
+        (LINEAR + b"]\x81", "arguments are not a tuple"),
+        (LINEAR + b"]R", "arguments are not a tuple"),
+        (b"NN", "other than one object"),
+        (b"N(", "other than one object"),
+        (b"\x80\x03N", "of protocol 3"),
+    ],
+)
+def test_other_combinations_are_refused(body: bytes, told: str) -> None:
+    assert told in _fault(body)
+
+
+def test_the_largest_that_is_read() -> None:
+    assert _read(program(b"(" + b"N" * MAX_TUPLE_ITEMS + b"t")) == (None,) * MAX_TUPLE_ITEMS
+    assert _read(program(b"\x8a\x0b" + b"\xff" * 10 + b"\x00")) == 2**MAX_INT_BITS - 1
+
+
+_PIECES = [
+    *(bytes([code]) for code in b"N\x88\x89])}(\x85\x86\x87teasubR\x81Q"),
+    *(b"q" + bytes([index]) for index in range(3)),
+    *(b"h" + bytes([index]) for index in range(3)),
+    *(text(value) for value in ("_modules", "_parameters", "module", "storage")),
+    *(LINEAR, ORDERED_DICT, FLOAT_STORAGE, REBUILD, REBUILD_PARAMETER),
+    *(storage("k", 3), tensor(storage("k", 3), (3,), (1,)), module(), number(7)),
+]
+
+
+@given(st.lists(st.sampled_from(_PIECES), max_size=40))
+def test_programs_of_known_opcodes_are_refused_or_harmless(pieces: list[bytes]) -> None:
+    with contextlib.suppress(ConversionError):
+        read = _read(program(b"](" + b"".join(pieces) + b"e"))
+        assert type(read) is list
+        assert {type(item) for item in read} <= _VALUES
+
+
+_VALUES = {
+    *(type(None), bool, int, str, list, tuple, dict),
+    *(InertModule, type(InertModule), Named, StorageRef, TensorRef),
+}
