@@ -1,0 +1,27 @@
+# The serving image: what pyproject's dependencies name and nothing else, as a user without rights.
+FROM python:3.11-slim AS build
+WORKDIR /src
+COPY pyproject.toml constraints.txt README.md LICENSE ./
+COPY proto proto
+COPY model model
+COPY service service
+COPY cab_forecast cab_forecast
+# The CPU build of torch: the default one brings gigabytes of CUDA
+RUN python -m venv /opt/cab-forecast \
+ && /opt/cab-forecast/bin/pip install --no-cache-dir --disable-pip-version-check \
+      --extra-index-url https://download.pytorch.org/whl/cpu -c constraints.txt .
+
+FROM python:3.11-slim
+RUN useradd --system --uid 10001 --no-create-home forecast
+COPY --from=build /opt/cab-forecast /opt/cab-forecast
+ENV PATH=/opt/cab-forecast/bin:$PATH \
+    PYTHONUNBUFFERED=1 \
+    FORECAST_HTTP=0.0.0.0:8080 \
+    FORECAST_GRPC=0.0.0.0:50051 \
+    FORECAST_LOG_JSON=true
+USER 10001
+EXPOSE 8080 50051
+HEALTHCHECK --interval=10s --timeout=3s --start-period=30s \
+  CMD ["python", "-c", "import urllib.request; urllib.request.urlopen('http://127.0.0.1:8080/readyz', timeout=2)"]
+# SIGTERM drains
+CMD ["cab-forecast", "serve"]
