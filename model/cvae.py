@@ -57,6 +57,10 @@ class CvaeForecaster(Forecaster):
         """Vehicles only: a pedestrian's state has no heading, and it sees no map."""
         return agent_type is AgentType.VEHICLE
 
+    def looks_at_map(self, agent_type: AgentType) -> bool:
+        """Vehicles only, if at all."""
+        return self.config.looks_at_map(agent_type)
+
     def prepare(self, scene: Scene, targets: Ints, context: Context = Context.FULL) -> Features:
         agent_type = scene.types[int(targets[0])]
         states = scene.states.last_frames(self.info.history_frames)

@@ -5,11 +5,12 @@ import torch
 
 from model.arrays import Float32s, Floats, Ints
 from model.forecaster import Context, Features
+from model.geometry import wrap_angle
 from model.neighbors import edge_ramps, neighbor_sums
 from model.networks.config import NetworkConfig
 from model.raster import PATCH_SIZE, cut_patches
 from model.scene import AgentStates, AgentType, Scene
-from model.standardization import state_scale, state_vectors
+from model.standardization import HEADING, state_scale, state_vectors
 
 
 def scene_features(
@@ -47,9 +48,13 @@ def scene_features(
 
 
 def _own_history(states: AgentStates, targets: Ints, agent_type: AgentType) -> Floats:
-    """[n, F, D], standardised, zero where not observed."""
+    """[n, F, D], standardised, zero where not observed; headings run on from the present one, without
+    jumps where they pass ±π."""
     history = state_vectors(states, agent_type)[targets]
     history[..., :2] -= states.position[targets, -1][:, None, :]
+    if history.shape[-1] > HEADING:
+        now = history[:, -1:, HEADING]
+        history[..., HEADING] = now + wrap_angle(history[..., HEADING] - now)
     history /= state_scale(agent_type, agent_type)
     return np.nan_to_num(history, nan=0.0)
 

@@ -96,6 +96,10 @@ class Forecaster(ABC):
         """Whether an agent of that type cannot be forecast without a heading now."""
         return False
 
+    def looks_at_map(self, agent_type: AgentType) -> bool:
+        """Whether forecasts of agents of that type depend on the map."""
+        return self.info.uses_map
+
     def __call__(
         self, scene: Scene, targets: Ints, context: Context = Context.FULL, steps: int | None = None
     ) -> TrajectoryMixture:

@@ -62,7 +62,7 @@ class TrajectoryMixture:
         """
         relative = (positions - self.origin[:, None, :]).to(self.means.dtype)
         offset = relative[:, None] - self.means
-        return _gaussian_log_density(offset, self.covariances)
+        return guarded_log_density(offset, self.covariances)
 
     def log_density(self, positions: Tensor) -> Tensor:
         """Log-density of the position at each step under the whole mixture: [N, T], 1/m² inside the log.
@@ -122,10 +122,27 @@ def cholesky_2x2(covariances: Tensor) -> Tensor:
     return torch.stack([torch.stack([l11, zero], dim=-1), torch.stack([l21, l22], dim=-1)], dim=-2)
 
 
-def _gaussian_log_density(offset: Tensor, covariance: Tensor) -> Tensor:
-    """Log-density at an offset [..., 2] from the mean of Gaussians [..., 2, 2]: [...]."""
-    xx, xy, yy = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
+LEAST_VARIANCE = 1e-8
+"""m², of a density; below it a variance counts as this."""
+LEAST_DECORRELATION = 1e-5
+"""1 − ρ², of a density; below it an ellipse counts as this slim."""
+
+
+def guarded_log_density(offset: Tensor, covariance: Tensor) -> Tensor:
+    """Log-density of Gaussians that may be degenerate: [...], always finite.
+
+    A step whose spread comes from one control alone has a covariance of rank one. As in the released
+    Trajectron++, variances and 1 − ρ² are bounded from below.
+
+    Args:
+        offset: [..., 2], m, from the mean.
+        covariance: [..., 2, 2], m².
+    """
+    xx = covariance[..., 0, 0].clamp_min(LEAST_VARIANCE)
+    yy = covariance[..., 1, 1].clamp_min(LEAST_VARIANCE)
+    sigma = (xx * yy).sqrt()
+    rho = covariance[..., 0, 1] / sigma
+    free = (1 - rho.square()).clamp(LEAST_DECORRELATION, 1.0)
     dx, dy = offset[..., 0], offset[..., 1]
-    determinant = (xx * yy - xy.square()).clamp_min(torch.finfo(covariance.dtype).tiny)
-    squared = (yy * dx.square() - 2 * xy * dx * dy + xx * dy.square()) / determinant
-    return -0.5 * (squared + determinant.log()) - math.log(2 * math.pi)
+    squared = (dx.square() / xx + dy.square() / yy - 2 * rho * dx * dy / sigma) / free
+    return -0.5 * (squared + (xx * yy * free).log()) - math.log(2 * math.pi)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from model.arrays import Float32s, Floats
+from model.arrays import Bytes, Float32s, Floats
 from model.scene import Raster
 
 PATCH_SIZE = 100
@@ -31,6 +31,8 @@ _REACH = math.hypot(PATCH_SIZE - ROWS_BEHIND, PATCH_SIZE - COLUMNS_RIGHT)
 
 def cut_patches(raster: Raster, position: Floats, heading: Floats) -> Float32s:
     """Map patches of N agents, bilinear between raster pixels, zero outside the raster.
+
+    A raster of twice the patch's resolution or more is first brought near it, so that thin lines stay.
 
     Positions are taken relative to the raster's origin in float64 and used to the fraction of a pixel.
 
@@ -59,10 +61,15 @@ def cut_patches(raster: Raster, position: Floats, heading: Floats) -> Float32s:
     # Only the part that the agents can see is turned into floats.
     low = np.maximum(np.floor(center[on_map].min(axis=0) - reach), 0).astype(np.int64)
     high = np.minimum(np.ceil(center[on_map].max(axis=0) + reach) + 1, [rows, columns]).astype(np.int64)
-    crop = torch.from_numpy(raster.layers[:, low[0] : high[0], low[1] : high[1]].astype(np.float32))
+    factor = max(int(raster.pixels_per_meter / PATCH_PIXELS_PER_METER), 1)
+    pixels = _coarsened(raster.layers[:, low[0] : high[0], low[1] : high[1]], factor)
+    crop = torch.from_numpy(pixels.astype(np.float32))
+    # Of coarser pixels, whose middle is that of those that they are made of
+    coarse = (center[on_map] - low - (factor - 1) / 2) / factor
+    scale = raster.pixels_per_meter / PATCH_PIXELS_PER_METER / factor
     seen = functional.grid_sample(
         crop.expand(int(on_map.sum()), -1, -1, -1),  # no copy: all agents read the same pixels
-        _grid(raster, center[on_map] - low, heading[on_map], (crop.shape[1], crop.shape[2])),
+        _grid(scale, coarse, heading[on_map], (crop.shape[1], crop.shape[2])),
         mode="bilinear",
         padding_mode="zeros",
         align_corners=False,
@@ -73,17 +80,31 @@ def cut_patches(raster: Raster, position: Floats, heading: Floats) -> Float32s:
     return patches
 
 
-def _grid(raster: Raster, center: Floats, heading: Floats, shape: tuple[int, int]) -> Tensor:
+def _coarsened(layers: Bytes, factor: int) -> Bytes:
+    """The layers in pixels of ``factor`` × ``factor``, set where any of theirs is.
+
+    Sampled as it is, a raster finer than the patch would lose lines that fall between the samples.
+    """
+    if factor == 1:
+        return layers
+    count, rows, columns = layers.shape
+    padded = np.zeros((count, -(-rows // factor) * factor, -(-columns // factor) * factor), dtype=np.uint8)
+    padded[:, :rows, :columns] = layers
+    split = padded.reshape(count, padded.shape[1] // factor, factor, padded.shape[2] // factor, factor)
+    coarse: Bytes = split.max(axis=(2, 4))
+    return coarse
+
+
+def _grid(scale: float, center: Floats, heading: Floats, shape: tuple[int, int]) -> Tensor:
     """Where each patch pixel lies, in the coordinates of ``grid_sample`` (column first, ∓1 half a pixel
     outside the outermost pixels): [N, 100, 100, 2].
 
     Args:
-        raster: gives the resolution.
+        scale: pixels of what is sampled to a pixel of the patch.
         center: [N, 2], the agents, pixels.
         heading: [N], rad.
         shape: rows and columns of what is sampled.
     """
-    scale = raster.pixels_per_meter / PATCH_PIXELS_PER_METER
     cos, sin = scale * np.cos(heading), scale * np.sin(heading)
     # pixel = center + i' (cos, sin) + j' (−sin, cos), with i' and j' counted from the agent's row, column.
     ahead, left = np.stack([sin, cos], axis=-1), np.stack([cos, -sin], axis=-1)  # [N, (column, row)]

@@ -5,7 +5,8 @@ the papers' released preprocessing differentiates centrally over whole tracks; a
 What an observation gives is used as it is; what it does not give is derived by backward differences.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,17 +29,22 @@ MIN_HEADING_SPEED = 0.5
 # Two frames older than those returned: the oldest velocity and acceleration are then differences, too,
 # wherever the agent has been seen that long.
 _EXTRA_FRAMES = 2
+_ROUNDING = 1e-6  # s; of differences of times since the epoch (a quarter of it at float64), with room
 
 
 def resample(observations: Observations, time: float, frames: int) -> AgentStates:
     """States on the grid ``time − k · 0.5 s``.
 
     Positions, and given headings, velocities and so on, are interpolated linearly between observations
-    at most ``MAX_GAP`` apart; history before a wider gap is dropped. An agent last seen up to
-    ``MAX_AGE`` ago is carried to the present at its velocity. Derivatives that are not given are
-    backward differences on the grid; where the oldest frame has no predecessor, its velocity and heading
-    rate are those of the next frame and its acceleration is zero. A heading that is not given is the
-    direction of motion from ``MIN_HEADING_SPEED`` on, else the last known one.
+    at most ``MAX_GAP`` apart; history before a wider gap is dropped. Derivatives that are not given are
+    backward differences on the grid, of values that are both given or both derived; where the oldest
+    frame has no predecessor, its velocity and heading rate are those of the next frame and its
+    acceleration is zero. A heading that is not given is the direction of motion from
+    ``MIN_HEADING_SPEED`` on (the opposite one for an agent whose given headings show that it reverses),
+    else the last known one.
+
+    An agent last seen up to ``MAX_AGE`` ago is carried to the present at its velocity then; velocity,
+    acceleration, heading and heading rate are those of its newest observation.
 
     Args:
         observations: N agents; none later than ``time`` (+ tolerance).
@@ -48,18 +54,27 @@ def resample(observations: Observations, time: float, frames: int) -> AgentState
     Returns:
         [N, F, …]; ``first`` is F for an agent that is not observed now.
     """
-    grid = time - STEP_SECONDS * np.arange(frames + _EXTRA_FRAMES - 1, -1, -1, dtype=np.float64)
-    sampled = _sample(observations, grid)
+    count = frames + _EXTRA_FRAMES
+    newest = _newest_time(observations)
+    sampled = _sample(observations, _grid(np.full(len(newest), time), count))
+    age = time - newest
+    carried = (age > TIME_TOLERANCE) & (age <= MAX_AGE + TIME_TOLERANCE)
+    if carried.any():
+        # How it moved when last seen: the same derivation, on a grid that ends there
+        last = _derive(_sample(observations, _grid(newest, count)))
+        ahead = last.velocity[carried, -1] * age[carried, None]
+        sampled.position[carried, -1] = last.position[carried, -1] + ahead
     states = _derive(sampled)
-    return states.last_frames(frames)
+    if carried.any():
+        for name in ("velocity", "acceleration", "heading", "heading_rate"):
+            getattr(states, name)[carried, -1] = getattr(last, name)[carried, -1]
+    known = _last_velocity_known(observations) & (states.first < count)
+    return replace(states, velocity_known=known).last_frames(frames)
 
 
-def velocity_known(observations: Observations, states: AgentStates) -> Bools:
-    """[N], whether the velocity now was given or could be derived: not so for a single position."""
-    rows = np.arange(len(observations.count))
-    last = observations.count - 1
-    given = np.isfinite(observations.velocity[rows, last]).all(axis=-1)
-    return given | (states.first < states.frames - 1) | (_last_span(observations) >= MIN_DIFFERENCE_SPAN)
+def _grid(ends: Floats, frames: int) -> Floats:
+    """Each agent's grid times [N, frames], which end at ``ends`` [N]."""
+    return ends[:, None] - STEP_SECONDS * np.arange(frames - 1, -1, -1, dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -76,9 +91,11 @@ class _Sampled:
 
 
 def _sample(obs: Observations, grid: Floats) -> _Sampled:
+    """Interpolates onto grids [N, E]. A last frame after the newest observation is there, without values
+    but for a position that stands in until the agent is carried there."""
     rows = np.arange(len(obs.count))[:, None]
     # How many observations lie at or before each grid time: [N, E]
-    left = (obs.time[:, :, None] <= grid + TIME_TOLERANCE).sum(axis=1) - 1
+    left = (obs.time[:, :, None] <= grid[:, None, :] + TIME_TOLERANCE).sum(axis=1) - 1
     before = left >= 0
     left = np.maximum(left, 0)
     last = obs.count[:, None] - 1
@@ -86,14 +103,14 @@ def _sample(obs: Observations, grid: Floats) -> _Sampled:
     t_left, t_right = obs.time[rows, left], obs.time[rows, right]
 
     exact = before & (np.abs(t_left - grid) <= TIME_TOLERANCE)
-    between = before & ~exact & (right > left) & (t_right - t_left <= MAX_GAP)
+    between = before & ~exact & (right > left) & (t_right - t_left <= MAX_GAP + _ROUNDING)
     carried = before & ~exact & (left == last) & (grid - t_left <= MAX_AGE + TIME_TOLERANCE)
     carried[:, :-1] = False  # only the present lies after the newest observation of an agent seen now
     there = exact | between | carried
 
     # The unbroken run that ends now; a gap too wide to interpolate over has a grid time within it.
     run = np.flip(np.logical_and.accumulate(np.flip(there, axis=1), axis=1), axis=1)
-    first = grid.size - run.sum(axis=1)
+    first = grid.shape[1] - run.sum(axis=1)
 
     weight = np.where(between, (grid - t_left) / np.where(between, t_right - t_left, 1.0), 0.0)
     right = np.where(between, right, left)
@@ -102,31 +119,22 @@ def _sample(obs: Observations, grid: Floats) -> _Sampled:
         w = weight.reshape(weight.shape + (1,) * (values.ndim - 2))
         a, b = values[rows, left], values[rows, right]
         result: Floats = a + w * (b - a)
+        result[~run] = np.nan
         return result
 
     a, b = obs.heading[rows, left], obs.heading[rows, right]
     heading = wrap_angle(a + weight * wrap_angle(b - a))  # along the shorter arc
-    position = interpolate(obs.position)
-    velocity = interpolate(obs.velocity)
-    acceleration = interpolate(obs.acceleration)
-    heading_rate = interpolate(obs.heading_rate)
-
-    # An agent carried to the present keeps its velocity, given or not, for the way there
-    last_velocity = _last_velocity(obs)
-    age = np.where(carried[:, -1], grid[-1] - t_left[:, -1], 0.0)
-    position[:, -1] += age[:, None] * np.nan_to_num(last_velocity)
-    velocity[:, -1] = np.where(carried[:, -1:], last_velocity, velocity[:, -1])
-
-    for values in (position, velocity, acceleration, heading, heading_rate):
-        values[~run] = np.nan
-    first_velocity = _first_velocity(obs, grid[np.minimum(first, grid.size - 1)])
-    return _Sampled(position, velocity, acceleration, heading, heading_rate, first, first_velocity)
-
-
-def _last_span(obs: Observations) -> Floats:
-    """[N], s: from the oldest usable observation (at most 0.5 s before the newest) to the newest."""
-    span: Floats = _newest_time(obs) - obs.time[np.arange(len(obs.count)), _last_partner(obs)]
-    return span
+    heading[~run] = np.nan
+    first_time = np.take_along_axis(grid, np.minimum(first, grid.shape[1] - 1)[:, None], axis=1)[:, 0]
+    return _Sampled(
+        position=interpolate(obs.position),
+        velocity=interpolate(obs.velocity),
+        acceleration=interpolate(obs.acceleration),
+        heading=heading,
+        heading_rate=interpolate(obs.heading_rate),
+        first=first,
+        first_velocity=_first_velocity(obs, first_time),
+    )
 
 
 def _newest_time(obs: Observations) -> Floats:
@@ -134,34 +142,25 @@ def _newest_time(obs: Observations) -> Floats:
     return newest
 
 
-def _last_partner(obs: Observations) -> Ints:
-    """[N], index of the observation that a difference to the newest one is taken with."""
-    newest = _newest_time(obs)[:, None]
-    inside = obs.time >= newest - STEP_SECONDS - TIME_TOLERANCE
-    oldest_inside = inside.argmax(axis=1)
-    # At rates under 2 Hz the previous observation is older than 0.5 s but still connected
-    previous = np.maximum(obs.count - 2, 0)
-    connected = newest[:, 0] - obs.time[np.arange(len(previous)), previous] <= MAX_GAP
-    lone = (oldest_inside == obs.count - 1) & connected
-    return np.where(lone, previous, oldest_inside)
-
-
-def _last_velocity(obs: Observations) -> Floats:
-    """[N, 2], m/s at the newest observation: given, else the difference over at most 0.5 s, else NaN."""
-    rows = np.arange(len(obs.count))
-    last, partner = obs.count - 1, _last_partner(obs)
-    span = _last_span(obs)
-    usable = span >= MIN_DIFFERENCE_SPAN
-    moved = obs.position[rows, last] - obs.position[rows, partner]
-    derived = np.where(usable[:, None], moved / np.where(usable, span, 1.0)[:, None], np.nan)
-    given = obs.velocity[rows, last]
-    return np.where(np.isfinite(given), given, derived)
+def _last_velocity_known(obs: Observations) -> Bools:
+    """[N], whether the newest observation gives its velocity, or an earlier one that is connected to it
+    (no gap wider than ``MAX_GAP``) is long enough ago for a difference."""
+    rows, last = np.arange(len(obs.count)), obs.count - 1
+    given = np.isfinite(obs.velocity[rows, last, 0])  # both components, or neither
+    with np.errstate(invalid="ignore"):  # the padding's differences
+        gap_after = np.diff(obs.time, axis=1, append=np.inf)
+    index = np.arange(obs.time.shape[1])[None, :]
+    fits = (gap_after <= MAX_GAP + _ROUNDING) | (index >= last[:, None])
+    connected = np.flip(np.logical_and.accumulate(np.flip(fits, axis=1), axis=1), axis=1)
+    early = obs.time <= _newest_time(obs)[:, None] - MIN_DIFFERENCE_SPAN + _ROUNDING
+    known: Bools = given | (connected & early & (index < last[:, None])).any(axis=1)
+    return known
 
 
 def _first_velocity(obs: Observations, first_time: Floats) -> Floats:
     """[N, 2], m/s over the observations in the half second up to the first grid frame; NaN where none.
 
-    There is no grid frame before it, so nothing older is connected to it.
+    There is no grid frame before it, so nothing older is connected to it, unless it is the only one.
 
     Args:
         first_time: [N], s, when the first grid frame is.
@@ -173,7 +172,7 @@ def _first_velocity(obs: Observations, first_time: Floats) -> Floats:
     oldest = np.where(some, usable_time.argmax(axis=1), 0)
     newest = np.where(some, oldest + usable_time.sum(axis=1) - 1, 0)
     span = obs.time[rows, newest] - obs.time[rows, oldest]
-    usable = span >= MIN_DIFFERENCE_SPAN
+    usable = span >= MIN_DIFFERENCE_SPAN - _ROUNDING
     moved = obs.position[rows, newest] - obs.position[rows, oldest]
     return np.where(usable[:, None], moved / np.where(usable, span, 1.0)[:, None], np.nan)
 
@@ -181,39 +180,64 @@ def _first_velocity(obs: Observations, first_time: Floats) -> Floats:
 def _derive(s: _Sampled) -> AgentStates:
     """Fills in what was not given."""
     frames = s.position.shape[1]
-    observed = np.arange(frames)[None, :] >= s.first[:, None]
-    is_first = np.arange(frames)[None, :] == s.first[:, None]
+    index = np.arange(frames)[None, :]
+    observed = index >= s.first[:, None]
+    is_first = index == s.first[:, None]
 
-    velocity = s.velocity
-    difference = _backward_difference(s.position)
-    difference[is_first] = s.first_velocity[s.first < frames]
-    velocity = np.where(np.isfinite(velocity), velocity, difference)
-    velocity = _fill_first_from_next(velocity, is_first)
-    velocity = np.where(np.isfinite(velocity), velocity, 0.0)
+    moved = _backward_difference(s.position)
+    moved[is_first] = s.first_velocity[s.first < frames]
+    moved = np.nan_to_num(_fill_first_from_next(moved, is_first))
+    velocity_given = np.isfinite(s.velocity[..., 0])  # both components are given, or neither
+    velocity = np.where(velocity_given[..., None], s.velocity, moved)
+    first_given = _fill_first_from_next(s.velocity, is_first)
+    velocity = np.where(
+        (is_first & ~velocity_given)[..., None] & np.isfinite(first_given), first_given, velocity
+    )
 
-    difference = _backward_difference(velocity)
-    acceleration = np.where(np.isfinite(s.acceleration), s.acceleration, np.nan_to_num(difference))
-    # An unobserved frame before the first one holds the zeros put in above, not a velocity
-    unknown = is_first & ~np.isfinite(s.acceleration).all(axis=-1)
-    acceleration[unknown] = 0.0
+    change = _like_with_like(s.velocity, moved, velocity_given)
+    change[is_first] = 0.0
+    acceleration = np.where(np.isfinite(s.acceleration), s.acceleration, np.nan_to_num(change))
 
-    heading = np.where(np.isfinite(s.heading), s.heading, _direction(velocity))
-    heading = _carry(heading, observed)
-    turned = np.full_like(heading, np.nan)
-    turned[:, 1:] = wrap_angle(heading[:, 1:] - heading[:, :-1]) / STEP_SECONDS
+    heading_given = np.isfinite(s.heading)
+    direction = _carry(_direction(moved), observed)
+    direction = _reversed_where_given_so(direction, s.heading)
+    heading = _carry(np.where(heading_given, s.heading, direction), observed)
+    turned = _like_with_like(s.heading, direction, heading_given, wrap_angle)
     turned[is_first] = np.nan
     heading_rate = np.where(np.isfinite(s.heading_rate), s.heading_rate, turned)
     heading_rate = np.nan_to_num(_fill_first_from_next(heading_rate, is_first))
 
     for values in (velocity, acceleration, heading, heading_rate):
         values[~observed] = np.nan
-    return AgentStates(s.position, velocity, acceleration, heading, heading_rate, s.first)
+    everyone = np.ones(len(s.first), dtype=np.bool_)
+    return AgentStates(s.position, velocity, acceleration, heading, heading_rate, s.first, everyone)
 
 
 def _backward_difference(values: Floats) -> Floats:
     """(values_t − values_{t−1}) / dt along axis 1; NaN at the first."""
     result = np.full_like(values, np.nan)
     result[:, 1:] = (values[:, 1:] - values[:, :-1]) / STEP_SECONDS
+    return result
+
+
+def _like_with_like(
+    given: Floats, derived: Floats, is_given: Bools, difference: Callable[[Floats], Floats] = lambda x: x
+) -> Floats:
+    """Backward difference quotients of given values, or else of derived ones, never across: a velocity
+    given for an instant and one derived over half a second differ even in steady braking.
+
+    Args:
+        given: [N, E, …], NaN where not given.
+        derived: likewise, everywhere.
+        is_given: [N, E].
+        difference: brings plain differences into range.
+    """
+    both = np.zeros_like(is_given)
+    both[:, 1:] = is_given[:, 1:] & is_given[:, :-1]
+    both = both.reshape(both.shape + (1,) * (given.ndim - 2))
+    result = np.full_like(derived, np.nan)
+    change = np.where(both[:, 1:], given[:, 1:] - given[:, :-1], derived[:, 1:] - derived[:, :-1])
+    result[:, 1:] = difference(change) / STEP_SECONDS
     return result
 
 
@@ -229,6 +253,16 @@ def _direction(velocity: Floats) -> Floats:
     """Heading of motion [N, E], NaN below the speed that tells it."""
     moving = np.hypot(velocity[..., 0], velocity[..., 1]) >= MIN_HEADING_SPEED
     return np.where(moving, np.arctan2(velocity[..., 1], velocity[..., 0]), np.nan)
+
+
+def _reversed_where_given_so(direction: Floats, given: Floats) -> Floats:
+    """Directions of motion as headings [N, E]: turned about for agents that go backwards, as their newest
+    given heading shows."""
+    apart = np.abs(wrap_angle(given - direction))
+    known = np.isfinite(apart)
+    newest = apart.shape[1] - 1 - np.flip(known, axis=1).argmax(axis=1)
+    backwards = known.any(axis=1) & (apart[np.arange(len(apart)), newest] > np.pi / 2)
+    return np.where(backwards[:, None], wrap_angle(direction + np.pi), direction)
 
 
 def _carry(values: Floats, observed: Bools) -> Floats:

@@ -1,7 +1,7 @@
 """What a forecaster sees: agents' states on the 0.5 s grid, and the map."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 
 import numpy as np
@@ -41,6 +41,8 @@ class AgentStates:
     """[N, F], rad/s."""
     first: Ints
     """[N], the first frame from which on the agent was observed without a break; F: not observed now."""
+    velocity_known: Bools
+    """[N], whether the velocity now was given or could be derived; where not, it is zero."""
 
     @property
     def frames(self) -> int:
@@ -55,7 +57,8 @@ class AgentStates:
     def last_frames(self, frames: int) -> "AgentStates":
         """The newest ``frames`` frames only (all of them where there are fewer)."""
         cut = max(self.frames - frames, 0)
-        return AgentStates(
+        return replace(
+            self,
             position=self.position[:, cut:],
             velocity=self.velocity[:, cut:],
             acceleration=self.acceleration[:, cut:],
@@ -63,6 +66,10 @@ class AgentStates:
             heading_rate=self.heading_rate[:, cut:],
             first=np.maximum(self.first - cut, 0),
         )
+
+    def select(self, agents: Bools | Ints) -> "AgentStates":
+        """Some of the agents, by mask [N] or indices [n]."""
+        return AgentStates(**{field.name: getattr(self, field.name)[agents] for field in fields(self)})
 
 
 @dataclass(frozen=True)

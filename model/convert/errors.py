@@ -6,4 +6,4 @@ class ConversionError(ValueError):
 
 
 class UnsafePickleError(ConversionError):
-    """A pickle names something that is not known to be harmless. Nothing of it was run."""
+    """A pickle names, calls or encodes something that is not known to be harmless. Nothing of it was run."""

@@ -25,13 +25,16 @@ class ModeDecoder(nn.Module):
         self.log_sigma = nn.Linear(DECODER_HIDDEN, 2)
         self.correlation = nn.Linear(DECODER_HIDDEN, 1)
 
-    def forward(self, encoding: Tensor, state_now: Tensor, steps: int) -> Controls:
-        """Controls of all modes; each step's mean is fed back into the next.
+    def forward(
+        self, encoding: Tensor, state_now: Tensor, steps: int, sample_controls: bool = False
+    ) -> Controls:
+        """Controls of all modes; each step's mean, or a sample, is fed back into the next.
 
         Args:
             encoding: [N, X].
             state_now: [N, D], standardised.
             steps: T.
+            sample_controls: feed back samples (training) instead of means (prediction).
 
         Returns:
             [N, K, T] each.
@@ -53,7 +56,7 @@ class ModeDecoder(nn.Module):
         for _ in range(steps):
             hidden = self.cell(torch.addmm(gates, action, w_gates), torch.addmm(new, action, w_new), hidden)
             outputs.append(F.linear(hidden, weight, head_bias))
-            action = outputs[-1][:, :2]
+            action = _sample(outputs[-1]) if sample_controls else outputs[-1][:, :2]
         # [5, N, K, T], contiguous: all that follows works on whole tensors of one quantity
         stacked = torch.stack(outputs).permute(2, 1, 0).contiguous().unflatten(1, (agents, modes))
         sigma = stacked[2:4].exp()
@@ -66,3 +69,11 @@ class ModeDecoder(nn.Module):
         [H, K], [N, H] → [N·K, H].
         """
         return (by_agent[:, None, :] + by_mode.T[None, :, :]).flatten(0, 1)
+
+
+def _sample(outputs: Tensor) -> Tensor:
+    """A draw from each control Gaussian, differentiable: [N, 5] heads → [N, 2]."""
+    mean, sigma, rho = outputs[:, :2], outputs[:, 2:4].exp(), torch.tanh(outputs[:, 4])
+    noise = torch.randn_like(mean)
+    second = rho * noise[:, 0] + (1 - rho.square()).clamp_min(0).sqrt() * noise[:, 1]
+    return mean + sigma * torch.stack([noise[:, 0], second], dim=1)

@@ -105,10 +105,25 @@ class AgentNetwork(nn.Module):
         encoded = self.future_encoder(future, features["history"][:, -1])
         return _centred(self.branch(context).posterior_logits(torch.cat([encoding, encoded], dim=1)))
 
-    def decode(self, encoding: Tensor, features: Features, context: Context, steps: int) -> Positions:
-        """Positions of every mode, relative to now: means [N, K, T, 2], covariances [N, K, T, 2, 2]."""
+    def decode(
+        self,
+        encoding: Tensor,
+        features: Features,
+        context: Context,
+        steps: int,
+        sample_controls: bool = False,
+    ) -> Positions:
+        """Positions of every mode, relative to now: means [N, K, T, 2], covariances [N, K, T, 2, 2].
+
+        Args:
+            encoding: [N, X], of the same context.
+            features: of the agents.
+            context: full or blind.
+            steps: T.
+            sample_controls: feed back samples of the controls instead of their means (training).
+        """
         branch = self.branch(context)
-        controls = branch.decoder(encoding, features["history"][:, -1], steps)
+        controls = branch.decoder(encoding, features["history"][:, -1], steps, sample_controls)
         if branch.heading_correction is None:
             return integrate_velocity(controls)
         velocity = features["velocity"]

@@ -7,10 +7,10 @@ import numpy as np
 import torch
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
-from model.arrays import Bools, Bytes, Float32s, Ints
+from model.arrays import Bytes, Float32s, Ints
 from model.forecaster import Context, Forecaster, Protocol
-from model.resample import MAX_AGE, resample, velocity_known
-from model.scene import AgentStates, AgentType, Raster, Scene
+from model.resample import MAX_AGE, MAX_GAP, MIN_DIFFERENCE_SPAN, resample
+from model.scene import AgentType, Raster, Scene
 from service.core.agents import Agents, read_agents
 from service.core.batcher import Job
 from service.core.catalog import Catalog
@@ -163,16 +163,16 @@ def _build_scene(
         return None, {}, faults
     states = resample(agents.observations, request.time, frames)
     now = states.first < states.frames
-    moving = velocity_known(agents.observations, states)
-    for row in np.flatnonzero(~(now & moving)).tolist():
+    kept = now & states.velocity_known
+    for row in np.flatnonzero(~kept).tolist():
         index = int(agents.valid[row])
         detail = (
-            "a single state needs its velocity, or another state at most 1.05 s before it"
+            "a single state needs its velocity, or another state "
+            f"{MIN_DIFFERENCE_SPAN} s to {MAX_GAP} s before it"
             if now[row]
             else f"the newest state is more than {MAX_AGE} s old"
         )
         faults[index] = Fault(f"agents[{index}].states", detail)
-    kept = now & moving
     if not kept.any():
         return None, {}, faults
     new_row = np.cumsum(kept) - 1
@@ -180,7 +180,7 @@ def _build_scene(
         int(new_row[row]): patch for row, patch in agents.patches.items() if kept[row]
     }
     types = [kind for kind, keep in zip(agents.types, kept.tolist(), strict=True) if keep]
-    scene = Scene(types=types, states=_subset(states, kept), raster=raster, patches=patches)
+    scene = Scene(types=types, states=states.select(kept), raster=raster, patches=patches)
     indices: Ints = agents.valid[kept]
     return scene, {int(index): row for row, index in enumerate(indices)}, faults
 
@@ -226,9 +226,13 @@ def _warnings(plan: Plan) -> list[str]:
             "the future; on live states it is less accurate than its published figures"
         )
     scene = plan.scene
-    looks = info.uses_map and plan.options.context is Context.FULL
-    if looks and scene is not None and scene.raster is None:
-        own = [draft for draft in plan.drafts if draft.forecaster is plan.forecaster]
+    if plan.options.context is Context.FULL and scene is not None and scene.raster is None:
+        # Of some types a model has learned nothing about the map: those agents lack none
+        own = [
+            draft
+            for draft in plan.drafts
+            if draft.forecaster is plan.forecaster and plan.forecaster.looks_at_map(scene.types[draft.row])
+        ]
         without = sum(draft.row not in scene.patches for draft in own)
         if without:
             warnings.append(
@@ -236,16 +240,3 @@ def _warnings(plan: Plan) -> list[str]:
                 "it saw an unknown one"
             )
     return warnings
-
-
-def _subset(states: AgentStates, kept: Bools) -> AgentStates:
-    if kept.all():
-        return states
-    return AgentStates(
-        position=states.position[kept],
-        velocity=states.velocity[kept],
-        acceleration=states.acceleration[kept],
-        heading=states.heading[kept],
-        heading_rate=states.heading_rate[kept],
-        first=states.first[kept],
-    )

@@ -78,6 +78,7 @@ def _scene(forecaster: Forecaster, kind: AgentType) -> Scene:
         heading=flat,
         heading_rate=flat,
         first=np.zeros(_SCENE_AGENTS, dtype=np.int64),
+        velocity_known=np.ones(_SCENE_AGENTS, dtype=np.bool_),
     )
     raster = Raster(np.ones((3, 200, 200), dtype=np.uint8), np.array([-30.0, -30.0]), 3.0)
     return Scene(types=[kind] * _SCENE_AGENTS, states=states, raster=raster)

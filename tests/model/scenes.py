@@ -26,6 +26,7 @@ def present(
         heading=_agent(heading),
         heading_rate=_agent(heading_rate),
         first=np.zeros(1, dtype=np.int64),
+        velocity_known=np.ones(1, dtype=np.bool_),
     )
     return Scene([kind], states)
 
@@ -44,7 +45,10 @@ def tracks(positions: Sequence[ArrayLike], frames: int, kind: AgentType = AgentT
         velocity[n, first[n] :] = np.diff(array, axis=0, prepend=array[:1]) / 0.5
     zeros = np.where(np.isnan(position), np.nan, 0.0)
     heading = np.full((count, frames), np.nan)
-    return Scene([kind] * count, AgentStates(position, velocity, zeros, heading, zeros[..., 0], first))
+    return Scene(
+        [kind] * count,
+        AgentStates(position, velocity, zeros, heading, zeros[..., 0], first, first < position.shape[1]),
+    )
 
 
 def _agent(values: ArrayLike) -> Floats:

@@ -136,6 +136,16 @@ def test_a_vehicle_without_heading_is_refused(model: CvaeForecaster) -> None:
         model(base, VEHICLES)
 
 
+def test_headings_across_half_a_turn_are_no_jump(model: CvaeForecaster) -> None:
+    """Driving along −x, headings a hair to either side of π are the same history."""
+    mixtures = []
+    for signs in ([1, 1, 1, 1, 1], [-1, 1, -1, 1, 1]):
+        base = scene()
+        base.states.heading[0] = np.array(signs) * (np.pi - 1e-4)
+        mixtures.append(model(base, VEHICLES[:1]))
+    torch.testing.assert_close(mixtures[0].means, mixtures[1].means, rtol=0, atol=0.01)
+
+
 def test_wrong_tensors_are_named() -> None:
     config = NetworkConfig(blind=BlindContext.NULL)
     info: ModelInfo = cab_network().info

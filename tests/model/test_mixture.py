@@ -161,3 +161,18 @@ def test_density_at_the_mean() -> None:
     )
     density = m.log_density(torch.zeros(1, 1, 2, dtype=torch.float64))
     assert density.item() == pytest.approx(-math.log(2 * math.pi * 4))
+
+
+def test_a_degenerate_mode_has_a_finite_density_that_falls_off() -> None:
+    """Rank one, and no spread at all: both come from networks, for agents that stand or drive straight."""
+    for covariance in (torch.tensor([[4.0, 2.0], [2.0, 1.0]]), torch.zeros(2, 2)):
+        mixture = TrajectoryMixture(
+            torch.zeros(1, 1),
+            torch.zeros(1, 1, 1, 2),
+            covariance.expand(1, 1, 1, 2, 2),
+            torch.zeros(1, 2, dtype=torch.float64),
+        )
+        near, off = (mixture.log_density(torch.tensor([[[x, 0.0]]]).double()).item() for x in (0.0, 3.0))
+        assert math.isfinite(near)
+        assert math.isfinite(off)
+        assert off < near - 10

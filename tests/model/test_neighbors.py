@@ -28,7 +28,7 @@ def states(position: Floats, first: list[int] | None = None, seed: int = 0) -> A
         return drawn
 
     position = np.where(seen[..., None], position, np.nan)
-    return AgentStates(position, values(2), values(2), values(), values(), begin)
+    return AgentStates(position, values(2), values(2), values(), values(), begin, begin < frames)
 
 
 def apart(distances: list[float]) -> AgentStates:
@@ -127,7 +127,9 @@ def test_turning_the_frame_turns_positions_and_keeps_relative_headings(angle: fl
     vectors = [plain.position, plain.velocity, plain.acceleration]
     position, velocity, acceleration = (rotate(values, np.array(angle)) for values in vectors)
     heading = wrap_angle(plain.heading + angle)
-    turned = AgentStates(position, velocity, acceleration, heading, plain.heading_rate, plain.first)
+    turned = AgentStates(
+        position, velocity, acceleration, heading, plain.heading_rate, plain.first, plain.velocity_known
+    )
     targets, others = np.array([0]), np.arange(1, 4)
     sums = []
     for s in (plain, turned):

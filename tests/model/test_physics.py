@@ -233,6 +233,7 @@ def test_only_the_targets_are_forecast_and_only_if_seen() -> None:
         heading=nan,
         heading_rate=nan,
         first=np.array([1, 0]),
+        velocity_known=np.array([False, True]),
     )
     scene = Scene([AgentType.VEHICLE, AgentType.CYCLIST], states)
     forecaster: Physics = BY_NAME["constant-velocity-yaw"]

@@ -162,3 +162,16 @@ def test_golden_patches(shared: Path) -> None:
         truncated.append(np.abs(cut_patches(raster, pixel[None], pose[2:])[0] - patch).mean())
     assert np.mean(exact) <= 0.01
     assert np.mean(truncated) <= 0.003
+
+
+@pytest.mark.parametrize("pixels_per_meter", [3.0, 6.0, 10.0, 30.0])
+def test_a_line_of_one_pixel_stays_in_the_patch_however_fine_the_raster(pixels_per_meter: float) -> None:
+    size = int(60 * pixels_per_meter)
+    layers = np.zeros((3, size, size), dtype=np.uint8)
+    layers[1, :, size // 2 + int(2 * pixels_per_meter)] = 1  # along x, 2 m to the left of the middle
+    raster = Raster(layers, np.array([-30.0, -30.0]), pixels_per_meter)
+    patch = cut_patches(raster, np.array([[0.0, 0.0]]), np.array([0.0]))[0, 1]
+    drawn = patch[10:90].max(axis=1)
+    assert (drawn > 0.45).all(), drawn.min()
+    columns = patch[10:90].argmax(axis=1)
+    assert (np.abs(columns - 56) <= 1).all()  # 2 m · 3 px/m left of column 50

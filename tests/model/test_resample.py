@@ -6,8 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from model.arrays import Floats
+from model.geometry import wrap_angle
 from model.observations import Observations
-from model.resample import TIME_TOLERANCE, resample, velocity_known
+from model.resample import TIME_TOLERANCE, resample
 from model.scene import STEP_SECONDS
 from tests.model.builders import Path, observations, track
 
@@ -81,7 +82,8 @@ def test_what_is_given_in_part_is_derived_in_part() -> None:
     states = resample(obs, NOW, 5)
     np.testing.assert_array_equal(states.velocity[0, -1], (9.0, 1.0))
     np.testing.assert_allclose(states.velocity[0, -2], (4.0, 0.0), atol=1e-6)
-    np.testing.assert_allclose(states.acceleration[0, -1], (10.0, 2.0), atol=1e-5)
+    # A given velocity and a derived one are not differenced: the positions show no acceleration
+    np.testing.assert_allclose(states.acceleration[0, -1], (0.0, 0.0), atol=1e-5)
 
 
 @given(
@@ -168,16 +170,16 @@ def test_short_fast_history_tells_the_velocity() -> None:
     states = resample(obs, NOW, 5)
     assert states.first[0] == 4
     np.testing.assert_allclose(states.velocity[0, -1], (6, -2), atol=1e-5)
-    assert velocity_known(obs, states)[0]
+    assert states.velocity_known[0]
 
 
 def test_a_single_position_tells_no_velocity() -> None:
     obs = one(np.array([NOW]), straight((6, -2)))
     states = resample(obs, NOW, 5)
     assert states.first[0] == 4
-    assert not velocity_known(obs, states)[0]
+    assert not states.velocity_known[0]
     obs.velocity[0, 0] = (6, -2)
-    assert velocity_known(obs, resample(obs, NOW, 5))[0]
+    assert resample(obs, NOW, 5).velocity_known[0]
 
 
 def test_agents_do_not_touch_each_other() -> None:
@@ -206,3 +208,71 @@ def test_turning_the_world_turns_the_states(angle: float) -> None:
     np.testing.assert_allclose(a.acceleration[0] @ turn.T, b.acceleration[0], atol=1e-8)
     difference = (b.heading[0] - a.heading[0] - angle + np.pi) % (2 * np.pi) - np.pi
     np.testing.assert_allclose(difference, 0, atol=1e-9)
+
+
+def braking(t: Floats) -> Floats:
+    """20 m/s now, braking at 4 m/s²."""
+    ago = t - NOW
+    return np.stack([20 * ago - 2 * ago**2, np.zeros_like(t)], axis=1)
+
+
+@pytest.mark.parametrize("age", [0.0, 0.1, 0.2, 0.3, 0.4, 0.5])
+def test_braking_does_not_fade_with_the_age_of_the_newest_state(age: float) -> None:
+    states = resample(one(at_rate(10, 4, NOW - age), braking), NOW, 5)
+    np.testing.assert_allclose(states.acceleration[0, -1], (-4.0, 0.0), atol=1e-4)
+
+
+def test_a_velocity_given_now_alone_makes_no_false_acceleration() -> None:
+    obs = one(at_rate(2, 3), braking)
+    obs.velocity[0, -1] = (20.0, 0.0)
+    np.testing.assert_allclose(resample(obs, NOW, 5).acceleration[0, -1], (-4.0, 0.0), atol=1e-4)
+
+
+def test_a_heading_given_now_alone_makes_no_false_turn() -> None:
+    obs = one(at_rate(2, 3), straight((-3.0, 0.0)))
+    obs.heading[0, -1] = 0.0  # it reverses
+    states = resample(obs, NOW, 5)
+    np.testing.assert_allclose(states.heading_rate[0], 0.0, atol=1e-6)
+    np.testing.assert_allclose(np.abs(wrap_angle(states.heading[0])), 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        [-1.5, -1.0, -0.48, -0.45],
+        [-1.5, -1.0, -0.52, -0.02, 0.0],
+        [-1.5, -1.0, -0.32, -0.30],
+        [-0.05, 0.0],
+        [-0.55, -0.3],
+        [-1.05, 0.0],
+    ],
+)
+@pytest.mark.parametrize("frames", [1, 5])
+def test_close_and_stale_states_keep_the_velocity(times: list[float], frames: int) -> None:
+    states = resample(one(NOW + np.array(times), straight((10.0, -4.0))), NOW, frames)
+    assert states.velocity_known[0]
+    observed = slice(int(states.first[0]), None)
+    np.testing.assert_allclose(
+        states.velocity[0, observed], np.broadcast_to([10.0, -4.0], (frames, 2))[observed], atol=2e-3
+    )
+    np.testing.assert_allclose(states.position[0, -1], (0.0, 0.0), atol=2e-3)
+
+
+@given(st.lists(st.floats(0, 1), min_size=2, max_size=12), st.floats(0, 0.5), st.integers(1, 9))
+def test_steady_motion_is_exact_or_said_to_be_unknown(gaps: list[float], age: float, frames: int) -> None:
+    times = NOW - age - np.cumsum([0.0, *(g + 1e-3 for g in gaps)])[::-1]
+    states = resample(one(times, straight((7.0, 3.0))), NOW, frames)
+    if not states.velocity_known[0]:
+        assert times[-1] - times[0] < 0.05
+        return
+    observed = slice(int(states.first[0]), None)
+    np.testing.assert_allclose(states.velocity[0, observed][:, 0], 7.0, atol=0.02)
+    np.testing.assert_allclose(states.acceleration[0, observed], 0.0, atol=0.04)
+    np.testing.assert_allclose(states.position[0, -1], (0.0, 0.0), atol=0.01)
+
+
+@pytest.mark.parametrize("age", [0.3, 0.5])
+def test_a_single_old_position_tells_no_velocity(age: float) -> None:
+    for frames in (1, 5):
+        states = resample(one(np.array([NOW - age]), straight((7.0, 3.0))), NOW, frames)
+        assert not states.velocity_known[0]

@@ -135,11 +135,16 @@ class Agent(_message.Message):
     """False: the agent is a neighbour for the others and gets no forecast. Default true."""
     @_builtins.property
     def states(self) -> _containers.RepeatedCompositeFieldContainer[Global___AgentState]:
-        """Observations, strictly ascending in time, none after the request's time; at least one, at most 512
-        by default. Any rate: they are resampled onto time − k · 0.5 s (linearly between observations at
-        most 1.05 s apart; older ones across a wider gap are not used). The newest must be at most 0.5 s
-        old; it is carried to the present at its velocity. What is not given is derived by backward
-        differences; what is given at a grid time is used as it is.
+        """Observations, strictly ascending in time, none after the request's time (0.1 ms count as the present);
+        at least one, at most 512 by default. A single one needs its velocity; without it another observation
+        0.05 s to 1.05 s before it. Successive ones may be 100 m/s · Δt + 5 m apart.
+
+        Any rate: they are resampled onto time − k · 0.5 s, linearly between observations at most 1.05 s apart;
+        what lies before a wider gap, and a grid time before the first observation, is not used (send a little
+        more than the model's history where frames jitter). The newest must be at most 0.5 s old; it is carried
+        to the present at its velocity. What is not given is derived by backward differences; what is given at
+        a grid time is used as it is. A heading that is not given is the direction of motion from 0.5 m/s on;
+        where nothing tells it, models that need it leave the agent to the fallback.
         """
 
     @_builtins.property
@@ -323,13 +328,15 @@ class SceneRaster(_message.Message):
     ORIGIN_Y_FIELD_NUMBER: _builtins.int
     PIXELS_PER_METER_FIELD_NUMBER: _builtins.int
     rows: _builtins.int
-    """Needed with packed_bits; with a PNG optional, and then checked. At most 4096 · 4096 pixels."""
+    """Needed with packed_bits; with a PNG optional, and then checked. At most 4096 · 4096 pixels by default."""
     columns: _builtins.int
     origin_x: _builtins.float
     """Ground position of row 0, column 0, in m, within ±1e7. Required."""
     origin_y: _builtins.float
     pixels_per_meter: _builtins.float
-    """Required, within 0.1 … 100."""
+    """Required, within 0.1 … 100. Patches have 3; of a raster twice as fine or finer, a coarser pixel is set
+    where any of its own is.
+    """
     @_builtins.property
     def image(self) -> Global___LayerImage: ...
     def __init__(
@@ -376,7 +383,7 @@ class PredictOptions(_message.Message):
     0 returns all.
     """
     samples: _builtins.int
-    """Trajectories to draw from the mixture for each agent; at most 2000, and 100,000 over a call."""
+    """Trajectories to draw from the mixture for each agent; at most 2000, and 100,000 over a call, by default."""
     seed: _builtins.int
     """Seed of the samples. Without one the server draws it and returns it."""
     horizon: _builtins.float
@@ -561,7 +568,7 @@ class Timing(_message.Message):
     INFERENCE_FIELD_NUMBER: _builtins.int
     BATCH_AGENTS_FIELD_NUMBER: _builtins.int
     queue: _builtins.float
-    """s from acceptance to the start of the (first) batch, waiting for the model to be free."""
+    """s from acceptance to the start of the (first) batch: decoding, and waiting for the model to be free."""
     inference: _builtins.float
     """s inside the model, of all batches that this call rode in."""
     batch_agents: _builtins.int

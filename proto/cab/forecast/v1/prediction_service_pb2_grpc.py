@@ -41,6 +41,10 @@ class PredictionServiceStub:
     a size limit (reason TOO_LARGE, no RetryInfo: do not retry)
     DEADLINE_EXCEEDED   the deadline passed before a forecast was made
     UNAVAILABLE         the server is starting or draining (with RetryInfo)
+    INTERNAL            a fault of the server, which its log describes
+
+    Sizes and counts said to be "by default" are settings of the server. A request is at most 16 MiB by
+    default.
     """
 
     def __init__(self, channel):
@@ -72,6 +76,10 @@ class PredictionServiceServicer:
     a size limit (reason TOO_LARGE, no RetryInfo: do not retry)
     DEADLINE_EXCEEDED   the deadline passed before a forecast was made
     UNAVAILABLE         the server is starting or draining (with RetryInfo)
+    INTERNAL            a fault of the server, which its log describes
+
+    Sizes and counts said to be "by default" are settings of the server. A request is at most 16 MiB by
+    default.
     """
 
     def Predict(self, request, context):
@@ -113,6 +121,10 @@ class PredictionService:
     a size limit (reason TOO_LARGE, no RetryInfo: do not retry)
     DEADLINE_EXCEEDED   the deadline passed before a forecast was made
     UNAVAILABLE         the server is starting or draining (with RetryInfo)
+    INTERNAL            a fault of the server, which its log describes
+
+    Sizes and counts said to be "by default" are settings of the server. A request is at most 16 MiB by
+    default.
     """
 
     @staticmethod

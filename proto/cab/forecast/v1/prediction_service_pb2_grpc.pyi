@@ -42,6 +42,10 @@ class PredictionServiceStub:
                           a size limit (reason TOO_LARGE, no RetryInfo: do not retry)
       DEADLINE_EXCEEDED   the deadline passed before a forecast was made
       UNAVAILABLE         the server is starting or draining (with RetryInfo)
+      INTERNAL            a fault of the server, which its log describes
+
+    Sizes and counts said to be "by default" are settings of the server. A request is at most 16 MiB by
+    default.
     """
 
     @_typing.overload
@@ -68,6 +72,10 @@ class PredictionServiceAsyncStub(PredictionServiceStub):
                           a size limit (reason TOO_LARGE, no RetryInfo: do not retry)
       DEADLINE_EXCEEDED   the deadline passed before a forecast was made
       UNAVAILABLE         the server is starting or draining (with RetryInfo)
+      INTERNAL            a fault of the server, which its log describes
+
+    Sizes and counts said to be "by default" are settings of the server. A request is at most 16 MiB by
+    default.
     """
 
     def __init__(self, channel: _aio.Channel) -> None: ...
@@ -90,6 +98,10 @@ class PredictionServiceServicer(metaclass=_abc_1.ABCMeta):
                           a size limit (reason TOO_LARGE, no RetryInfo: do not retry)
       DEADLINE_EXCEEDED   the deadline passed before a forecast was made
       UNAVAILABLE         the server is starting or draining (with RetryInfo)
+      INTERNAL            a fault of the server, which its log describes
+
+    Sizes and counts said to be "by default" are settings of the server. A request is at most 16 MiB by
+    default.
     """
 
     @_abc_1.abstractmethod
