@@ -1,5 +1,6 @@
 """Calls over REST: protobuf or JSON bodies, errors as RFC 9457 problems."""
 
+import asyncio
 import math
 import ssl
 import time
@@ -57,10 +58,14 @@ class RestTransport:
         """As ``Transport.call``."""
         sent = self._codec.request(method, request, budget)
         try:
-            response = self._client.send(sent)
+            response = self._client.send(sent, stream=True)
+            try:
+                complete = _read(response, budget)
+            finally:
+                response.close()
         except httpx.TransportError as error:
             raise self._codec.lost(error, budget) from error
-        return self._codec.answer(method, response)
+        return self._codec.answer(method, complete)
 
     def close(self) -> None:
         """As ``Transport.close``."""
@@ -78,8 +83,10 @@ class AsyncRestTransport:
         """As ``AsyncTransport.call``."""
         sent = self._codec.request(method, request, budget)
         try:
-            response = await self._client.send(sent)
-        except httpx.TransportError as error:
+            # httpx bounds each read by itself: a body that trickles would never be late
+            async with asyncio.timeout(budget.remaining()):
+                response = await self._client.send(sent)
+        except (httpx.TransportError, TimeoutError) as error:
             raise self._codec.lost(error, budget) from error
         return self._codec.answer(method, response)
 
@@ -139,9 +146,9 @@ class _Codec:
             raise InternalError(f"the answer of {self._endpoint.url} cannot be read: {error}") from error
         return message
 
-    def lost(self, error: httpx.TransportError, budget: Budget) -> ForecastError:
+    def lost(self, error: httpx.TransportError | TimeoutError, budget: Budget) -> ForecastError:
         """The exception for a call that brought no HTTP response."""
-        if isinstance(error, httpx.TimeoutException):
+        if isinstance(error, (httpx.TimeoutException, TimeoutError)):
             return DeadlineExceeded(f"no answer from {self._endpoint.url} within {budget.timeout:g} s")
         cause = str(error) or type(error).__name__
         return Unavailable(f"no connection to {self._endpoint.url}: {cause}", reason=UNREACHABLE)
@@ -150,6 +157,24 @@ class _Codec:
         if self._media_type == _MEDIA_TYPES["json"]:
             return json_format.MessageToJson(request, preserving_proto_field_name=True, indent=None).encode()
         return request.SerializeToString()
+
+
+def _read(response: httpx.Response, budget: Budget) -> httpx.Response:
+    """A streamed response with its body.
+
+    httpx bounds each read of a body by what was left when the body began, so that one which trickles would
+    never be late. Here the clock is looked at after each read: the last one may overrun, no more.
+
+    Raises:
+        DeadlineExceeded: the body took too long.
+    """
+    body = bytearray()
+    for chunk in response.iter_raw():
+        budget.remaining()
+        body += chunk
+    return httpx.Response(
+        response.status_code, headers=response.headers, content=bytes(body), extensions=response.extensions
+    )
 
 
 def error_from_response(response: httpx.Response) -> ForecastError:

@@ -21,11 +21,6 @@ from service.telemetry.metrics import Metrics
 _log = structlog.get_logger(__name__)
 
 
-_FLUSH_SECONDS = 1
-"""s for the last answers to get out once all calls are through. No more: a health watch, or a stream like
-it, would use up whatever it is given."""
-
-
 class StartError(Exception):
     """The server cannot start; the text says why, for an operator."""
 
@@ -44,9 +39,7 @@ class Server:
         self.dataplane = DataPlane(settings, self.metrics)
         self._load = load or (lambda: _load_models(settings))
         self._grpc = GrpcServer(self.dataplane, self.metrics, settings)
-        self._http = HttpServer(
-            build_app(self.dataplane, self.metrics, settings), settings.http, _FLUSH_SECONDS
-        )
+        self._http = HttpServer(build_app(self.dataplane, self.metrics, settings), settings.http)
         self._signalled = asyncio.Event()
 
     @property
@@ -75,7 +68,7 @@ class Server:
         except BaseException:
             await self.stop(drain=False)
             raise
-        await self._grpc.set_serving(not self._signalled.is_set())
+        self._grpc.set_serving(not self._signalled.is_set())
         _log.info(
             "ready",
             http=self.http_address,
@@ -86,16 +79,21 @@ class Server:
     async def stop(self, drain: bool = True) -> None:
         """Refuses new calls, finishes the accepted ones within ``drain_seconds``, and stops.
 
+        An answer counts as finished when the client has it: what the calls leave of that time is for those
+        that read slowly.
+
         Args:
             drain: False: accepted calls are not waited for.
         """
         started = time.perf_counter()
         self.dataplane.refuse()
-        await self._grpc.set_serving(False)
+        self._grpc.set_serving(False)
+        grace = 0.0
         if drain:
             _log.info("draining")
             await self.dataplane.drain(self.settings.drain_seconds)
-        await asyncio.gather(self._grpc.stop(_FLUSH_SECONDS), self._http.stop())
+            grace = max(started + self.settings.drain_seconds - time.perf_counter(), 0.0)
+        await asyncio.gather(self._grpc.stop(grace), self._http.stop(grace))
         await self.dataplane.close()
         _log.info("stopped", seconds=round(time.perf_counter() - started, 3))
 
@@ -144,7 +142,8 @@ class Server:
             raise StartError(
                 f"http: cannot listen on {self.settings.http}: {error.strerror or error}"
             ) from error
-        _log.info("listening", http=self.http_address, grpc=self.grpc_address)
+        authentication = "bearer tokens" if self.settings.api_tokens else "off: everyone is let in"
+        _log.info("listening", http=self.http_address, grpc=self.grpc_address, authentication=authentication)
 
 
 def _load_models(settings: Settings) -> Registry:

@@ -1,6 +1,7 @@
 """Settings of the server: flags over ``FORECAST_*`` over a TOML file over defaults."""
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -14,6 +15,8 @@ from pydantic_settings import (
     TomlConfigSettingsSource,
 )
 
+from service.environment import CONFIG, PREFIX, unknown_variable
+
 FALLBACK_MODEL = "constant-velocity-yaw"
 """The model of agents that the model asked for cannot forecast."""
 
@@ -25,9 +28,7 @@ class SettingsError(Exception):
 class Settings(BaseSettings):
     """What an operator can set. Every name is an environment variable too: ``http`` is ``FORECAST_HTTP``."""
 
-    model_config = SettingsConfigDict(
-        env_prefix="FORECAST_", extra="forbid", frozen=True, protected_namespaces=()
-    )
+    model_config = SettingsConfigDict(env_prefix=PREFIX, extra="forbid", frozen=True, protected_namespaces=())
 
     http: str = "127.0.0.1:8080"
     """HOST:PORT of REST; port 0 takes a free one."""
@@ -43,7 +44,7 @@ class Settings(BaseSettings):
     allow_paper_protocol: bool = False
     """Load models trained by the paper protocol, too; they warn in every answer."""
     api_tokens: Annotated[tuple[SecretStr, ...], NoDecode] = ()
-    """Bearer tokens that are let in; none: everyone is. Comma-separated in the environment."""
+    """Bearer tokens that are let in; not set: everyone is. Comma-separated in the environment."""
 
     max_agents: int = Field(default=512, ge=1)
     """Agents of a request."""
@@ -89,7 +90,14 @@ class Settings(BaseSettings):
     @classmethod
     def _split_tokens(cls, value: object) -> object:
         if isinstance(value, str):
-            return tuple(token.strip() for token in value.split(",") if token.strip())
+            # A comma at the end is no token. Nothing but commas is none at all, which would let everyone
+            # in where someone meant to let in a few: an empty secret, say.
+            tokens = tuple(token.strip() for token in value.split(",") if token.strip())
+            if not tokens:
+                raise ValueError("is set but names no token; leave it out to let everyone in")
+            return tokens
+        if isinstance(value, Sequence):
+            return tuple(_strip_token(token) for token in value)
         return value
 
     @field_validator("log_level", mode="before")
@@ -124,9 +132,12 @@ def load(config: Path | None = None, **flags: Any) -> Settings:
         flags: what the command line gives; None counts as not given.
 
     Raises:
-        SettingsError: a value is wrong, or the file is not there.
+        SettingsError: a value is wrong, a variable sets nothing, or the file is not there.
     """
-    named = os.environ.get("FORECAST_CONFIG")
+    unknown = unknown_variable(os.environ, Settings.model_fields)
+    if unknown is not None:
+        raise SettingsError(unknown)
+    named = os.environ.get(CONFIG)
     file = config or (Path(named) if named else None)
     if file is not None and not file.is_file():
         raise SettingsError(f"no such configuration file: {file}")
@@ -142,6 +153,22 @@ def load(config: Path | None = None, **flags: Any) -> Settings:
     except ValueError as error:  # a file that is no TOML
         raise SettingsError(f"{file}: {error}") from None
     return settings
+
+
+def _strip_token(token: object) -> object:
+    """A token without the blanks around it.
+
+    Raises:
+        ValueError: nothing else is left.
+    """
+    if isinstance(token, SecretStr):
+        token = token.get_secret_value()
+    if not isinstance(token, str):
+        return token
+    stripped = token.strip()
+    if not stripped:
+        raise ValueError("one of the tokens is empty")
+    return stripped
 
 
 def _describe(problem: ErrorDetails) -> str:

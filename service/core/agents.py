@@ -200,11 +200,11 @@ class _StateTable:
             infinite = present & ~np.isfinite(values)
             outside = present & (np.abs(values) > _BOUNDS)
             wrong = infinite | outside | (required & ~present)
-            if wrong.any():
-                for row, column in np.argwhere(wrong).tolist():
-                    self._add(row, _FIELDS[column], self._value_detail(row, column))
+            for row in self._first_of_each(np.flatnonzero(wrong.any(axis=1))):
+                column = int(wrong[row].argmax())
+                self._add(row, _FIELDS[column], self._value_detail(row, column))
             for first, second in _PAIRS:
-                for row in np.flatnonzero(present[:, first] != present[:, second]).tolist():
+                for row in self._first_of_each(np.flatnonzero(present[:, first] != present[:, second])):
                     missing = second if present[row, first] else first
                     self._add(
                         row, _FIELDS[missing], f"give both {_FIELDS[first]} and {_FIELDS[second]} or neither"
@@ -236,11 +236,23 @@ class _StateTable:
             heading_rate=padded[:, :, _RATE],
         )
 
+    def _first_of_each(self, rows: Ints) -> list[int]:
+        """The first of these rows of each agent that has no fault yet: only one an agent is told, and to
+        put a million into words takes seconds.
+
+        Args:
+            rows: [R], ascending.
+        """
+        owners, firsts = np.unique(self._owner[rows], return_index=True)
+        unknown = [int(agent) not in self.faults for agent in self._agents[owners]]
+        first_rows: list[int] = rows[firsts[np.array(unknown, dtype=np.bool_)]].tolist()
+        return first_rows
+
     def _add(self, row: int, name: str, detail: str) -> None:
         owner = int(self._owner[row])
         agent = int(self._agents[owner])
         state = row - int(self._starts[owner])
-        self.faults.setdefault(agent, Fault(f"agents[{agent}].states[{state}].{name}", detail))
+        self.faults[agent] = Fault(f"agents[{agent}].states[{state}].{name}", detail)
 
     def _value_detail(self, row: int, column: int) -> str:
         if not self._present[row, column]:
@@ -255,15 +267,15 @@ class _StateTable:
 
     def _find_time_faults(self) -> None:
         times = self._values[:, _TIME]
-        for row in np.flatnonzero(times > self._now + TIME_TOLERANCE).tolist():
+        for row in self._first_of_each(np.flatnonzero(times > self._now + TIME_TOLERANCE)):
             self._add(row, "time", f"is {times[row] - self._now:.3g} s after the request's time")
         # Within the tolerance of the present an observation counts as of the present.
         np.minimum(times, self._now, out=times)
         after = self._successive()
-        for row in after[times[after] <= times[after - 1]].tolist():
+        for row in self._first_of_each(after[times[after] <= times[after - 1]]):
             self._add(row, "time", "must be after the state before it")
         last = self._starts + self._counts - 1
-        for row in last[times[last] < self._now - MAX_AGE - TIME_TOLERANCE].tolist():
+        for row in self._first_of_each(last[times[last] < self._now - MAX_AGE - TIME_TOLERANCE]):
             age = self._now - times[row]
             self._add(row, "time", f"the newest state is {age:.3g} s old; at most {MAX_AGE} s")
 
@@ -271,9 +283,10 @@ class _StateTable:
         after = self._successive()
         step = self._values[after] - self._values[after - 1]
         distance = np.hypot(step[:, _X], step[:, _Y])
-        for index in np.flatnonzero(distance > MAX_SPEED * step[:, _TIME] + JUMP_SLACK).tolist():
+        for row in self._first_of_each(after[distance > MAX_SPEED * step[:, _TIME] + JUMP_SLACK]):
+            index = int(np.searchsorted(after, row))
             self._add(
-                int(after[index]),
+                row,
                 "x",
                 f"jumps {distance[index]:.4g} m in {step[index, _TIME]:.3g} s from the state before it",
             )

@@ -55,7 +55,7 @@ class Outcome:
     mixture: TrajectoryMixture
     """Of the job's agents, in order."""
     queue: float
-    """s from acceptance until its (first) batch started."""
+    """s from the call's acceptance until its (first) batch started."""
     inference: float
     """s in the model, of all its batches."""
     batch_agents: int
@@ -63,11 +63,18 @@ class Outcome:
 
 
 class Admission:
-    """A call's place in the queue, held from its acceptance until its batches start."""
+    """A call's place in the queue, held until its batches start."""
 
-    def __init__(self, agents: int) -> None:
+    def __init__(self, agents: int, accepted: float | None = None) -> None:
+        """
+        Args:
+            agents: that hold a place.
+            accepted: when the call was accepted, by ``time.perf_counter``; None: now.
+        """
         self.agents = agents
         """Agents that still hold a place."""
+        self.accepted = time.perf_counter() if accepted is None else accepted
+        """When the call was accepted, by ``time.perf_counter``."""
 
 
 @dataclass(eq=False)
@@ -80,6 +87,7 @@ class _Entry:
     deadline: float
     admission: Admission
     queued: float
+    """By ``time.perf_counter``."""
     done: "asyncio.Future[Outcome]" = field(
         default_factory=lambda: asyncio.get_running_loop().create_future()
     )
@@ -143,18 +151,19 @@ class Batcher:
         self._require_room(1)
 
     @contextmanager
-    def admit(self, agents: int) -> Iterator[Admission]:
+    def admit(self, agents: int, accepted: float | None = None) -> Iterator[Admission]:
         """A place in the queue for a call, before any work is put into it.
 
         Args:
             agents: that the call wants forecast; a call of none counts as one.
+            accepted: when the call was accepted, by ``time.perf_counter``; None: now.
 
         Raises:
             Overloaded: there is no room.
         """
         agents = max(agents, 1)
         self._require_room(agents)
-        admission = Admission(agents)
+        admission = Admission(agents, accepted)
         self._count(agents)
         try:
             yield admission
@@ -278,7 +287,8 @@ class Batcher:
             part = mixture[position : position + entry.agents]
             position += entry.agents
             if not entry.done.done():
-                outcome = Outcome(_cut(part, entry.job.steps), started - entry.queued, seconds, agents)
+                queue = started - entry.admission.accepted
+                outcome = Outcome(_cut(part, entry.job.steps), queue, seconds, agents)
                 entry.done.set_result(outcome)
 
     def _fail(self, batch: Sequence[_Entry], error: Internal | Unavailable) -> None:

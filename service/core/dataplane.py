@@ -3,9 +3,11 @@
 import asyncio
 import os
 import secrets
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import asynccontextmanager, contextmanager
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import TypeVar
 
@@ -18,6 +20,7 @@ from cab.forecast.v1 import prediction_service_pb2 as pb
 from service.core.batcher import Admission, Batcher, Outcome
 from service.core.catalog import Catalog, Models, build_catalog
 from service.core.encode import Result, encode, finite
+from service.core.incoming import Encoded, Reader
 from service.core.options import read_options
 from service.core.plan import Draft, Group, Plan, check_strict, fall_back, make_plan
 from service.core.warmup import warm_up
@@ -39,6 +42,32 @@ class Phase(StrEnum):
     DRAINING = "draining"
 
 
+@dataclass(frozen=True)
+class Call:
+    """A call that was accepted."""
+
+    deadline: float
+    """On the event loop's clock, s; the client's or the server's own, whichever is earlier."""
+    catalog: Catalog
+    """The models that there are for it."""
+
+    @asynccontextmanager
+    async def in_time(self) -> AsyncIterator[None]:
+        """Cuts off at the deadline what is done for the call within this.
+
+        Raises:
+            DeadlineExceeded: it passed.
+        """
+        timeout = asyncio.timeout_at(self.deadline)
+        try:
+            async with timeout:
+                yield
+        except TimeoutError:
+            if not timeout.expired():
+                raise
+            raise DeadlineExceeded("the deadline passed before a forecast was made") from None
+
+
 class DataPlane:
     """The service itself. Lives on one event loop; decoding, encoding and the model have threads."""
 
@@ -52,6 +81,7 @@ class DataPlane:
         self._threads = ThreadPoolExecutor(
             min(_MAX_WORKERS, (os.cpu_count() or 1) + 1), thread_name_prefix="calls"
         )
+        self._reader = Reader(self._threads)
         self._phase = Phase.STARTING
         self._calls = 0
         self._idle = asyncio.Event()
@@ -86,7 +116,7 @@ class DataPlane:
         self._phase = Phase.DRAINING
 
     async def drain(self, seconds: float) -> bool:
-        """Waits for the accepted calls, so long at most; whether all were answered."""
+        """Waits until the answers of all accepted calls are out, so long at most; whether they are."""
         self.refuse()
         try:
             async with asyncio.timeout(seconds):
@@ -101,38 +131,50 @@ class DataPlane:
         await self._batcher.stop()
         await asyncio.to_thread(self._threads.shutdown, cancel_futures=True)
 
-    def check(self) -> None:
-        """Whether a forecast could be accepted now: to be asked before work goes into reading a request.
+    @contextmanager
+    def accept(self, timeout: float | None = None) -> Iterator[Call]:
+        """Takes a call in as it arrives, before any work goes into it. A drain waits for it until this is
+        left, which a transport does when the answer is out.
+
+        Args:
+            timeout: s that the client gives; the server's own limit holds as well.
 
         Raises:
             Unavailable: not ready.
             Overloaded: the queue is full.
         """
-        self._accept()
+        catalog = self._require_ready()
         self._batcher.check()
+        limit = self._settings.max_timeout
+        seconds = limit if timeout is None else min(timeout, limit)
+        self._calls += 1
+        self._idle.clear()
+        try:
+            yield Call(asyncio.get_running_loop().time() + seconds, catalog)
+        finally:
+            self._calls -= 1
+            if self._calls == 0:
+                self._idle.set()
 
-    async def predict(self, request: pb.PredictRequest, deadline: float | None = None) -> pb.PredictResponse:
+    async def predict(
+        self, request: pb.PredictRequest | Encoded, call: Call | None = None
+    ) -> pb.PredictResponse:
         """Forecasts the agents of a scene. Cancelling the call takes it out of the queue.
 
         Args:
             request: as it came.
-            deadline: on the event loop's clock (s); the server's own limit holds as well.
+            call: that it came with; None: it is accepted here.
 
         Raises:
             ServiceError: whatever row of the table applies.
         """
-        catalog = self._accept()
-        limit = asyncio.get_running_loop().time() + self._settings.max_timeout
-        deadline = limit if deadline is None else min(deadline, limit)
-        with self._counted():
-            timeout = asyncio.timeout_at(deadline)
-            try:
-                async with timeout:
-                    return await self._predict(request, catalog, deadline)
-            except TimeoutError:
-                if not timeout.expired():
-                    raise
-                raise DeadlineExceeded("the deadline passed before a forecast was made") from None
+        if call is None:
+            with self.accept() as own:
+                return await self.predict(request, own)
+        accepted = time.perf_counter()
+        async with call.in_time():
+            message = await self._reader.read(request) if isinstance(request, Encoded) else request
+            return await self._predict(message, call, accepted)
 
     async def list_models(self, request: models_pb.ListModelsRequest) -> models_pb.ListModelsResponse:
         """All models.
@@ -140,7 +182,7 @@ class DataPlane:
         Raises:
             Unavailable: not ready.
         """
-        catalog = self._accept()
+        catalog = self._require_ready()
         return models_pb.ListModelsResponse(
             models=[catalog.describe(info) for info in catalog.models.infos()]
         )
@@ -153,19 +195,18 @@ class DataPlane:
             UnknownModel: not loaded.
             Unavailable: not ready.
         """
-        catalog = self._accept()
+        catalog = self._require_ready()
         if not request.name:
             raise BadField("name", "is required")
         return models_pb.GetModelResponse(model=catalog.describe(catalog.get(request.name).info))
 
-    async def _predict(
-        self, request: pb.PredictRequest, catalog: Catalog, deadline: float
-    ) -> pb.PredictResponse:
+    async def _predict(self, request: pb.PredictRequest, call: Call, accepted: float) -> pb.PredictResponse:
+        catalog = call.catalog
         forecaster = catalog.get(request.model)
         options = read_options(request, forecaster.info, self._settings)
-        with self._batcher.admit(options.predicted) as admission:
+        with self._batcher.admit(options.predicted, accepted) as admission:
             plan = await self._in_thread(make_plan, request, options, forecaster, catalog, self._settings)
-            results, outcomes = await self._forecast(plan, deadline, admission)
+            results, outcomes = await self._forecast(plan, call.deadline, admission)
         seed = 0
         if options.samples:
             seed = secrets.randbits(32) if options.seed is None else options.seed
@@ -213,21 +254,10 @@ class DataPlane:
             status = pb.ForecastStatus.Name(draft.status).removeprefix("FORECAST_STATUS_").lower()
             self._metrics.agents.labels(name, status).inc()
 
-    def _accept(self) -> Catalog:
+    def _require_ready(self) -> Catalog:
         if self._catalog is None or self._phase is not Phase.READY:
             raise Unavailable(f"the server is {self._phase.value}")
         return self._catalog
-
-    @contextmanager
-    def _counted(self) -> Iterator[None]:
-        self._calls += 1
-        self._idle.clear()
-        try:
-            yield
-        finally:
-            self._calls -= 1
-            if self._calls == 0:
-                self._idle.set()
 
     async def _in_thread(self, function: Callable[..., _T], *arguments: object) -> _T:
         return await asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)

@@ -1,18 +1,16 @@
 """Binary map layers out of bytes that a stranger sent."""
 
 import io
-import struct
 
 import numpy as np
 from PIL import Image
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.arrays import Bytes
+from service.core.png import PngError, pixels_only, read_header
 from service.errors import BadField
 
 LAYERS = 3
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_PNG_HEADER_BYTES = 33  # signature, and the chunk IHDR with its length, name and checksum
 _RGB_8 = (8, 2)  # bit depth, colour type
 
 
@@ -54,23 +52,28 @@ def _unpack(packed: bytes, field: str, rows: int | None, columns: int | None) ->
 
 def _decode_png(png: bytes, field: str, rows: int | None, columns: int | None, max_pixels: int) -> Bytes:
     # The size is read from the header by hand and checked before Pillow sees a byte: a decompression
-    # bomb is refused for what it says it is, and what says less than it holds is cut off there.
-    if len(png) < _PNG_HEADER_BYTES or not png.startswith(_PNG_SIGNATURE) or png[12:16] != b"IHDR":
-        raise BadField(field, "is not a PNG")
-    width, height, depth, colour = struct.unpack(">IIBB", png[16:26])
-    if (depth, colour) != _RGB_8:
+    # bomb is refused for what it says it is, and what says less than it holds is cut off there. Of the
+    # rest Pillow gets the pixels alone: it would unpack every compressed text, too.
+    try:
+        header = read_header(png)
+    except PngError as error:
+        raise BadField(field, str(error)) from None
+    width, height = header.width, header.height
+    if (header.bit_depth, header.color_type) != _RGB_8:
         raise BadField(field, "must be 8-bit RGB without alpha")
     if (rows is not None and height != rows) or (columns is not None and width != columns):
         raise BadField(field, f"is {height} × {width} pixels, expected {rows or 'any'} × {columns or 'any'}")
     if not 0 < width * height <= max_pixels:
         raise BadField(field, f"is {height} × {width} pixels; 1 to {max_pixels} are accepted")
     try:
-        with Image.open(io.BytesIO(png), formats=["PNG"]) as picture:
+        with Image.open(io.BytesIO(pixels_only(png)), formats=["PNG"]) as picture:
             if picture.mode != "RGB" or picture.size != (width, height):
                 raise BadField(field, "must be 8-bit RGB without alpha")
             pixels = np.asarray(picture)
     except BadField:
         raise
+    except PngError as error:
+        raise BadField(field, f"cannot be decoded: {error}") from None
     except Exception as error:  # Pillow raises a dozen kinds on broken data; each says the same here
         raise BadField(field, f"cannot be decoded: {type(error).__name__}") from error
     return np.ascontiguousarray((pixels >= 128).transpose(2, 0, 1)).view(np.uint8)

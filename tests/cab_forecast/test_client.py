@@ -1,5 +1,6 @@
 """Calls over both transports, by both kinds of client."""
 
+import gzip
 import os
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from cab.forecast.v1.model_service_pb2 import ListModelsResponse
 from cab_forecast import (
     AsyncClient,
     BadRequest,
@@ -26,7 +28,16 @@ from cab_forecast import (
     demo_request,
 )
 from tests.cab_forecast.answers import answer
-from tests.cab_forecast.fakes import MODELS, Failure, Raw, Script, free_port, grpc_fake, http_fake
+from tests.cab_forecast.fakes import (
+    MODELS,
+    Failure,
+    Raw,
+    Script,
+    free_port,
+    grpc_fake,
+    http_fake,
+    trickling_server,
+)
 
 Call = Callable[..., Any]
 QUICK = {"retries": 0}
@@ -165,6 +176,22 @@ def test_a_late_answer_is_a_deadline_exceeded(call: Call, script: Script) -> Non
     # Closing a client does not wait for the answer either; the fakes' own shutdown is not counted.
     assert time.monotonic() - start < 0.95
     assert len(script.calls) == 1
+
+
+def test_a_body_that_trickles_is_late_too(call_at: Call) -> None:
+    with trickling_server() as address:
+        start = time.monotonic()
+        with pytest.raises(DeadlineExceeded, match=r"within 0\.4 s"):
+            call_at(f"http://{address}", {}, "list_models", timeout=0.4)
+        assert 0.35 < time.monotonic() - start < 1.5  # it would have come after 20 s
+
+
+def test_a_gateway_may_compress(call_at: Call, script: Script) -> None:
+    content = ListModelsResponse(models=MODELS).SerializeToString()
+    headers = {"content-type": "application/x-protobuf", "content-encoding": "gzip"}
+    script.failures = [Raw(200, gzip.compress(content), headers)]
+    with http_fake(script) as address:
+        assert call_at(f"http://{address}", {}, "list_models") == MODELS
 
 
 @pytest.mark.parametrize("scheme", ["grpc", "http"])

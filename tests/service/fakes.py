@@ -29,6 +29,7 @@ class FakeForecaster(Forecaster):
         supports_blind: bool = True,
         protocol: Protocol = Protocol.CAUSAL,
         needs_heading: bool = False,
+        map_types: tuple[AgentType, ...] | None = None,
     ) -> None:
         self.info = ModelInfo(
             name=name,
@@ -48,6 +49,7 @@ class FakeForecaster(Forecaster):
             license="Apache-2.0",
         )
         self.needs_heading = needs_heading
+        self.map_types = map_types
         self.free = threading.Event()
         """Cleared: forwards wait."""
         self.free.set()
@@ -62,6 +64,9 @@ class FakeForecaster(Forecaster):
 
     def requires_heading(self, agent_type: AgentType) -> bool:
         return self.needs_heading
+
+    def looks_at_map(self, agent_type: AgentType) -> bool:
+        return self.info.uses_map and (self.map_types is None or agent_type in self.map_types)
 
     def prepare(self, scene: Scene, targets: Ints, context: Context = Context.FULL) -> Features:
         self.scenes.append(scene)

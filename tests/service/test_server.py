@@ -7,13 +7,16 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+import time
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager, suppress
 from pathlib import Path
 
 import grpc
 import httpx
 import pytest
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+from structlog.testing import capture_logs
 
 from cab_forecast import Client
 from model.registry import Registry
@@ -21,7 +24,7 @@ from service.server import Server, StartError
 from service.settings import Settings
 from tests.service.fakes import FakeForecaster, registry
 from tests.service.requests import make_request
-from tests.service.servers import PREDICT, call_grpc, call_rest, running, settings, until_waiting
+from tests.service.servers import PREDICT, CallError, call_grpc, call_rest, running, settings, until_waiting
 
 
 @contextmanager
@@ -83,6 +86,200 @@ async def test_stop_answers_what_was_accepted() -> None:
         await stopping
         for response in await asyncio.gather(*calls):
             assert len(response.forecasts) == 1
+
+
+_PACE = 0.008
+"""s between reads of 64 KiB: some 2.5 s for an answer."""
+
+
+def long_answer() -> bytes:
+    """A request for 19 MB: more than the buffers on the way take."""
+    return make_request(100, samples=1000, seed=1).SerializeToString()
+
+
+async def read_slowly(reader: asyncio.StreamReader) -> AsyncIterator[bytes]:
+    while chunk := await reader.read(2**16):
+        yield chunk
+        await asyncio.sleep(_PACE)
+
+
+async def connect(address: str) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    """A connection with small buffers of its own."""
+    connected = socket.socket()
+    connected.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2**16)
+    connected.setblocking(False)
+    host, port = address.split(":")
+    await asyncio.get_running_loop().sock_connect(connected, (host, int(port)))
+    return await asyncio.open_connection(sock=connected, limit=2**16)
+
+
+async def close(writer: asyncio.StreamWriter) -> None:
+    writer.close()
+    with suppress(ConnectionError):
+        await writer.wait_closed()
+
+
+async def send_over_http(server: Server) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    body = long_answer()
+    reader, writer = await connect(server.http_address)
+    head = "POST /v1/predict HTTP/1.1\r\nHost: x\r\nContent-Type: application/x-protobuf\r\n"
+    writer.write(f"{head}Content-Length: {len(body)}\r\n\r\n".encode() + body)
+    return reader, writer
+
+
+async def test_stop_waits_for_those_who_read_slowly_over_http() -> None:
+    async with running(FakeForecaster()) as server:
+        reader, writer = await send_over_http(server)
+        answer = bytearray(await reader.readuntil(b"\r\n\r\n"))
+        [length] = [
+            int(v)
+            for k, _, v in (h.partition(b": ") for h in answer.split(b"\r\n"))
+            if k == b"content-length"
+        ]
+        stopping = asyncio.create_task(server.stop())
+        body = b"".join([chunk async for chunk in read_slowly(reader)])
+        await stopping
+        await close(writer)
+    assert length > 15_000_000
+    assert len(body) == length
+
+
+@asynccontextmanager
+async def slow_proxy(address: str) -> AsyncIterator[str]:
+    """Carries bytes to a server at once, and slowly back."""
+
+    async def carry(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        server_reader, server_writer = await connect(address)
+
+        async def send() -> None:
+            while chunk := await reader.read(2**16):
+                server_writer.write(chunk)
+
+        sending = asyncio.create_task(send())
+        async for chunk in read_slowly(server_reader):
+            writer.write(chunk)
+            await writer.drain()
+        sending.cancel()
+        for end in (server_writer, writer):
+            await close(end)
+
+    carrying: list[asyncio.Task[None]] = []
+    proxy = await asyncio.start_server(
+        lambda *ends: carrying.append(asyncio.create_task(carry(*ends))), "127.0.0.1", 0
+    )
+    async with proxy:
+        yield f"127.0.0.1:{proxy.sockets[0].getsockname()[1]}"
+    await asyncio.gather(*carrying)
+
+
+async def test_stop_waits_for_those_who_read_slowly_over_grpc() -> None:
+    options = [("grpc.max_receive_message_length", -1), ("grpc.use_local_subchannel_pool", 1)]
+    request = long_answer()
+    async with (
+        running(FakeForecaster()) as server,
+        slow_proxy(server.grpc_address) as address,
+        grpc.aio.insecure_channel(address, options=options) as channel,
+    ):
+        predict = channel.unary_unary(PREDICT, None, None)
+        await predict(make_request(1).SerializeToString())
+        call = asyncio.ensure_future(predict(request))
+        async with asyncio.timeout(20):
+            # Sent, but not out: the agents are counted when the answer is made
+            while server.metrics.registry.get_sample_value(*_AGENTS_OK) != 101:  # noqa: ASYNC110
+                await asyncio.sleep(0.01)
+        started = time.monotonic()
+        await server.stop()
+        assert len(await call) > 15_000_000
+        assert time.monotonic() - started > 1.5  # or the test has shown nothing
+
+
+_AGENTS_OK = ("forecast_agents_total", {"model": "fake", "status": "ok"})
+
+
+async def test_stop_gives_up_on_those_who_do_not_read() -> None:
+    async with running(FakeForecaster(), drain_seconds=0.5) as server:
+        reader, writer = await send_over_http(server)
+        await reader.readexactly(1)
+        started = time.monotonic()
+        await server.stop()
+        assert 0.4 < time.monotonic() - started < 5
+        with pytest.raises((asyncio.IncompleteReadError, ConnectionError)):
+            await reader.readexactly(19_000_000)
+        await close(writer)
+
+
+async def test_a_request_that_is_still_coming_was_accepted() -> None:
+    body = make_request(1).SerializeToString()
+    async with running(FakeForecaster()) as server:
+        reader, writer = await connect(server.http_address)
+        head = "POST /v1/predict HTTP/1.1\r\nHost: x\r\nContent-Type: application/x-protobuf\r\n"
+        writer.write(f"{head}Content-Length: {len(body)}\r\n\r\n".encode() + body[:10])
+        async with asyncio.timeout(10):
+            while not server.dataplane._calls:  # noqa: ASYNC110 - no event tells
+                await asyncio.sleep(0.005)
+        stopping = asyncio.create_task(server.stop())
+        await asyncio.sleep(0.2)
+        writer.write(body[10:])
+        assert (await reader.read(2**16)).startswith(b"HTTP/1.1 200 OK")
+        await stopping
+        await close(writer)
+
+
+async def test_a_body_that_does_not_come_is_late() -> None:
+    async with running(FakeForecaster(), max_timeout=0.2) as server:
+        reader, writer = await connect(server.http_address)
+        writer.write(b"POST /v1/predict HTTP/1.1\r\nHost: x\r\nContent-Length: 10\r\n\r\n{")
+        assert (await reader.readline()).startswith(b"HTTP/1.1 504")
+        await close(writer)
+
+
+async def test_stop_waits_for_no_health_watch() -> None:
+    statuses = health_pb2.HealthCheckResponse
+    async with (
+        running(FakeForecaster()) as server,
+        grpc.aio.insecure_channel(server.grpc_address) as channel,
+    ):
+        watch = health_pb2_grpc.HealthStub(channel).Watch(health_pb2.HealthCheckRequest())
+        assert (await watch.read()).status == statuses.SERVING
+        started = time.monotonic()
+        await server.stop()
+        assert time.monotonic() - started < 5
+        assert (await watch.read()).status == statuses.NOT_SERVING
+        with pytest.raises(grpc.aio.AioRpcError) as caught:
+            await watch.read()
+        assert caught.value.code() is grpc.StatusCode.UNAVAILABLE
+
+
+@pytest.mark.parametrize(("tokens", "told"), [((), "off: everyone is let in"), (("t",), "bearer tokens")])
+async def test_the_log_says_who_is_let_in(tokens: tuple[str, ...], told: str) -> None:
+    with capture_logs() as logs:
+        async with running(FakeForecaster(), api_tokens=tokens):
+            pass
+    assert [entry["authentication"] for entry in logs if entry["event"] == "listening"] == [told]
+
+
+@pytest.mark.parametrize(
+    ("body", "content_type"),
+    [
+        (b"\x22\x00" * (8 * 2**20 - 1), "application/x-protobuf"),
+        (b'{"agents":[' + b"{}," * 5_000_000 + b"{}]}", "application/json"),
+    ],
+    ids=["protobuf", "json"],
+)
+async def test_a_million_agents_are_refused_in_no_time(body: bytes, content_type: str) -> None:
+    async with running(FakeForecaster()) as server:
+        with pytest.raises(CallError) as caught:
+            await call_rest(server, body, {"content-type": content_type})
+        assert (caught.value.reason, caught.value.message) == ("TOO_LARGE", _TOO_LARGE[content_type])
+        if content_type == "application/x-protobuf":
+            with pytest.raises(CallError, match="more than 512 agents"):
+                await call_grpc(server, body)
+
+
+_TOO_LARGE = {
+    "application/x-protobuf": "more than 512 agents",
+    "application/json": "more objects than 512 agents and 262144 states have",
+}
 
 
 async def test_stop_does_not_wait_for_ever() -> None:

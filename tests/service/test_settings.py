@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pydantic import SecretStr
 
 from service.settings import SettingsError, load, split_address
 
@@ -45,6 +46,37 @@ def test_tokens_are_read_and_not_shown(config: Path, monkeypatch: pytest.MonkeyP
     settings = load()
     assert [token.get_secret_value() for token in settings.api_tokens] == ["s3cret", "other"]
     assert "s3cret" not in repr(settings)
+
+
+@pytest.mark.parametrize("value", ["", ",", " ", " , ,"])
+def test_tokens_that_are_set_but_empty_let_nobody_in(value: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FORECAST_API_TOKENS", value)
+    with pytest.raises(SettingsError, match="api_tokens: is set but names no token"):
+        load()
+
+
+@pytest.mark.parametrize(
+    "line", ['api_tokens = ""', 'api_tokens = [""]', 'api_tokens = ["s3cret", " "]', "api_tokens = [7]"]
+)
+def test_tokens_of_a_file_that_are_empty(line: str, tmp_path: Path) -> None:
+    file = tmp_path / "server.toml"
+    file.write_text(line + "\n")
+    with pytest.raises(SettingsError, match="api_tokens") as caught:
+        load(file)
+    assert "s3cret" not in str(caught.value)
+
+
+def test_tokens_of_a_file_are_stripped(tmp_path: Path) -> None:
+    file = tmp_path / "server.toml"
+    file.write_text('api_tokens = [" a", "b\\n"]\n')
+    assert [token.get_secret_value() for token in load(file).api_tokens] == ["a", "b"]
+    assert load(api_tokens=(SecretStr(" c "),)).api_tokens == (SecretStr("c"),)
+
+
+def test_variables_that_set_nothing_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FORECAST_MAX_AGENT", "3")
+    with pytest.raises(SettingsError, match=r"FORECAST_MAX_AGENT: .* nearest is FORECAST_MAX_AGENTS"):
+        load()
 
 
 @pytest.mark.parametrize(

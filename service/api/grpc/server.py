@@ -1,11 +1,12 @@
 """The gRPC server."""
 
 from grpc import aio
-from grpc_health.v1 import health, health_pb2, health_pb2_grpc
+from grpc_health.v1 import health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from service.api.auth import Tokens
 from service.api.grpc.handlers import MODEL_SERVICE, PREDICTION_SERVICE, Handlers
+from service.api.grpc.health import HEALTH_SERVICE, Health
 from service.api.grpc.interceptor import AuthInterceptor
 from service.core.dataplane import DataPlane
 from service.settings import Settings
@@ -31,11 +32,11 @@ class GrpcServer:
                 ("grpc.so_reuseport", 0),  # or a second server would share the port in silence
             ],
         )
-        self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]  # missing in the stubs
-        handlers = Handlers(dataplane, metrics, settings.max_request_bytes)
+        self._health = Health(_SERVICES)
+        handlers = Handlers(dataplane, metrics, settings)
         self._server.add_generic_rpc_handlers(tuple(handlers.generic()))
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
-        names = (*_SERVICES, health.SERVICE_NAME, reflection.SERVICE_NAME)
+        names = (*_SERVICES, HEALTH_SERVICE, reflection.SERVICE_NAME)
         reflection.enable_server_reflection(names, self._server)
         self.address = ""
         """HOST:PORT that is listened on."""
@@ -46,7 +47,6 @@ class GrpcServer:
         Raises:
             OSError: the port is taken or the host is not ours.
         """
-        await self.set_serving(False)
         host = self._settings.grpc.rpartition(":")[0]
         try:
             port = self._server.add_insecure_port(self._settings.grpc)
@@ -55,14 +55,11 @@ class GrpcServer:
         self.address = f"{host}:{port}"
         await self._server.start()
 
-    async def set_serving(self, serving: bool) -> None:
+    def set_serving(self, serving: bool) -> None:
         """Tells health, for "" and each service."""
-        status = (
-            health_pb2.HealthCheckResponse.SERVING if serving else health_pb2.HealthCheckResponse.NOT_SERVING
-        )
-        for name in ("", *_SERVICES):
-            await self._health.set(name, status)
+        self._health.set_serving(serving)
 
     async def stop(self, grace: float) -> None:
         """Takes no more calls and gives those under way so many seconds."""
+        self._health.close()
         await self._server.stop(grace)

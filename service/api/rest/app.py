@@ -10,11 +10,11 @@ from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 
-from service.api.auth import Tokens
 from service.api.boundary import to_service_error
 from service.api.rest.endpoints import Endpoints
 from service.api.rest.openapi import openapi_document
 from service.api.rest.problem import problem_response
+from service.api.rest.sending import HoldUntilSent
 from service.core.dataplane import DataPlane, Phase
 from service.errors import BadField, MethodNotAllowed, NotFound, ServiceError, Unavailable
 from service.settings import Settings
@@ -40,7 +40,8 @@ def build_app(dataplane: DataPlane, metrics: Metrics, settings: Settings) -> Fas
     )
     app.openapi = lambda: document  # type: ignore[method-assign]  # the way that FastAPI documents
 
-    endpoints = Endpoints(dataplane, metrics, Tokens(settings.api_tokens), settings.max_request_bytes)
+    app.add_middleware(HoldUntilSent)
+    endpoints = Endpoints(dataplane, metrics, settings)
     routes: list[tuple[str, str, Callable[[Request], Awaitable[Response]]]] = [
         ("POST", "/v1/predict", endpoints.predict),
         ("GET", "/v1/models", endpoints.list_models),

@@ -1,4 +1,4 @@
-"""The contract's messages as JSON, by protobuf's JSON mapping, and as protobuf.
+"""The contract's messages as JSON, by protobuf's JSON mapping.
 
 Reading is protobuf's own ``ParseDict``: camelCase and snake_case names, numbers as strings, base64 bytes.
 Writing is our own: a forecast is tens of thousands of numbers, over which ``MessageToDict`` takes one at
@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import orjson
 from google.protobuf import json_format
 from google.protobuf.descriptor import Descriptor, EnumDescriptor, FieldDescriptor
-from google.protobuf.message import DecodeError, Message
+from google.protobuf.message import Message
 
 from service.errors import BadField
 
@@ -26,6 +26,7 @@ _Encoder = Callable[[Any], Any]
 _FIELD_IN_ERROR = re.compile(r"Failed to parse (\w+) field")
 _PATH_IN_ERROR = re.compile(r' at "?\w+((?:\.\w+(?:\[\d+\])?)*)"?\.*$')
 _MAX_REASON = 200
+_MAX_TEXT = 4000
 _UNKNOWN_IN_ERROR = re.compile(r'has no field named "(.{0,64}?)" at "\w+((?:\.\w+(?:\[\d+\])?)*)"', re.DOTALL)
 
 
@@ -35,12 +36,30 @@ def parse_json(message_type: type[_M], body: bytes) -> _M:
     Raises:
         BadField: it is no JSON, or not of that message; names the field as far as it can be told.
     """
+    return from_document(message_type, load_document(body))
+
+
+def load_document(body: bytes) -> dict[str, Any]:
+    """A JSON object.
+
+    Raises:
+        BadField: it is none.
+    """
     try:
         document = orjson.loads(body)
     except orjson.JSONDecodeError as error:
         raise BadField("body", f"is no JSON: {error}") from error
     if not isinstance(document, dict):
         raise BadField("body", "must be a JSON object")
+    return document
+
+
+def from_document(message_type: type[_M], document: dict[str, Any]) -> _M:
+    """A message from a JSON object.
+
+    Raises:
+        BadField: it is not of that message; names the field as far as it can be told.
+    """
     message = message_type()
     try:
         json_format.ParseDict(document, message)
@@ -52,18 +71,6 @@ def parse_json(message_type: type[_M], body: bytes) -> _M:
             "body", f"is no {message_type.DESCRIPTOR.name}: a value is of the wrong kind"
         ) from error
     return message
-
-
-def parse_protobuf(message_type: type[_M], body: bytes) -> _M:
-    """A message from its wire form.
-
-    Raises:
-        BadField: it is none.
-    """
-    try:
-        return message_type.FromString(body)
-    except DecodeError as error:
-        raise BadField("body", f"is no {message_type.DESCRIPTOR.full_name}") from error
 
 
 def to_json(message: Message) -> bytes:
@@ -83,6 +90,8 @@ def to_dict(message: Message) -> dict[str, Any]:
 
 def _fault(text: str) -> BadField:
     """The field that a ParseError is about, and why, from its text."""
+    if len(text) > _MAX_TEXT:  # the value that is wrong may be megabytes
+        text = text[: _MAX_TEXT // 2] + text[-_MAX_TEXT // 2 :]
     text = text.split("\n", 1)[0]
     unknown = _UNKNOWN_IN_ERROR.search(text)
     if unknown:

@@ -1,6 +1,7 @@
 """The contract's methods over HTTP, and the one place where their errors become problems."""
 
 import asyncio
+import functools
 from collections.abc import Awaitable, Callable
 from typing import TypeVar
 
@@ -10,14 +11,19 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 
 from cab.forecast.v1 import model_service_pb2 as models_pb
-from cab.forecast.v1 import prediction_service_pb2 as pb
 from service.api.auth import Tokens
 from service.api.boundary import to_service_error
-from service.api.rest.codec import parse_json, parse_protobuf, to_json
+from service.api.rest import requests
+from service.api.rest.codec import to_json
 from service.api.rest.negotiation import Format, answer_format, request_format, timeout
 from service.api.rest.problem import problem_response
+from service.api.rest.sending import held
+from service.core import wire
 from service.core.dataplane import DataPlane
+from service.core.incoming import LARGE_BYTES, Encoded
+from service.core.sizes import Sizes
 from service.errors import TooLarge
+from service.settings import Settings
 from service.telemetry.metrics import Metrics
 
 _log = structlog.get_logger(__name__)
@@ -29,13 +35,12 @@ _CLIENT_CLOSED_REQUEST = 499
 class Endpoints:
     """The handlers of ``/v1``."""
 
-    def __init__(
-        self, dataplane: DataPlane, metrics: Metrics, tokens: Tokens, max_request_bytes: int
-    ) -> None:
+    def __init__(self, dataplane: DataPlane, metrics: Metrics, settings: Settings) -> None:
         self._dataplane = dataplane
         self._metrics = metrics
-        self._tokens = tokens
-        self._max_bytes = max_request_bytes
+        self._tokens = Tokens(settings.api_tokens)
+        self._max_bytes = settings.max_request_bytes
+        self._sizes = Sizes.of(settings)
 
     async def predict(self, request: Request) -> Response:
         """POST /v1/predict."""
@@ -69,16 +74,13 @@ class Endpoints:
             return response
 
     async def _predict(self, request: Request) -> Response:
-        arrived = asyncio.get_running_loop().time()
         incoming = request_format(request.headers)
         outgoing = answer_format(request.headers, preferred=incoming)
-        seconds = timeout(request.headers)
-        deadline = None if seconds is None else arrived + seconds
-        self._dataplane.check()  # JSON takes its time, which a call that is refused anyway should not cost
-        body = await self._read_body(request)
-        parse = parse_json if incoming is Format.JSON else parse_protobuf
-        message = await asyncio.to_thread(parse, pb.PredictRequest, body)
-        answer = await _unless_disconnected(request, self._dataplane.predict(message, deadline))
+        call = held(request).enter_context(self._dataplane.accept(timeout(request.headers)))
+        async with call.in_time():
+            body = await self._read_body(request)
+        encoded = self._encoded(body, incoming)
+        answer = await _unless_disconnected(request, self._dataplane.predict(encoded, call))
         return await asyncio.to_thread(_respond, answer, outgoing)
 
     async def _list_models(self, request: Request) -> Response:
@@ -89,6 +91,11 @@ class Endpoints:
         outgoing = answer_format(request.headers, preferred=Format.JSON)
         name: str = request.path_params["name"]
         return _respond(await self._dataplane.get_model(models_pb.GetModelRequest(name=name)), outgoing)
+
+    def _encoded(self, body: bytes, incoming: Format) -> Encoded:
+        if incoming is Format.JSON:  # never quick
+            return Encoded(body, functools.partial(requests.read_request, sizes=self._sizes))
+        return Encoded(body, functools.partial(wire.read_request, sizes=self._sizes), LARGE_BYTES)
 
     async def _read_body(self, request: Request) -> bytes:
         """The body, refused as soon as it is known to be too large, however it is sent."""

@@ -11,12 +11,14 @@ from fastapi import FastAPI
 from service.settings import split_address
 
 _POLL = 0.005
+_SHORTEST_GRACE = 0.1
+"""s; with none at all uvicorn would not even look whether there is anything to wait for."""
 
 
 class HttpServer:
     """uvicorn on a socket of ours, stopped by us and not by signals."""
 
-    def __init__(self, app: FastAPI, address: str, flush_seconds: int) -> None:
+    def __init__(self, app: FastAPI, address: str) -> None:
         self._wanted = address
         self._server = _Uvicorn(
             uvicorn.Config(
@@ -26,7 +28,6 @@ class HttpServer:
                 lifespan="off",
                 ws="none",
                 server_header=False,
-                timeout_graceful_shutdown=flush_seconds,
             )
         )
         self._task: asyncio.Task[None] | None = None
@@ -47,11 +48,14 @@ class HttpServer:
         while not self._server.started and not self._task.done():  # noqa: ASYNC110
             await asyncio.sleep(_POLL)
 
-    async def stop(self) -> None:
-        """Takes no more connections and waits for the calls under way."""
-        if self._task is not None:
-            self._server.should_exit = True
-            await self._task
+    async def stop(self, grace: float) -> None:
+        """Takes no more connections and gives the answers under way so many seconds."""
+        if self._task is None:
+            return
+        self._server.config.timeout_graceful_shutdown = max(grace, _SHORTEST_GRACE)  # type: ignore[assignment]  # fractions do
+        self._server.should_exit = True
+        await self._task
+        self._server.abort_connections()
 
 
 class _Uvicorn(uvicorn.Server):
@@ -59,6 +63,13 @@ class _Uvicorn(uvicorn.Server):
     def capture_signals(self) -> Iterator[None]:
         """None: signals are for the whole process, of which HTTP is a part."""
         yield
+
+    def abort_connections(self) -> None:
+        """Drops those that the grace was too short for; uvicorn leaves them to the end of the process."""
+        for connection in list(self.server_state.connections):
+            transport = connection.transport
+            if transport is not None:
+                transport.abort()
 
 
 def _listen(address: str) -> socket.socket:

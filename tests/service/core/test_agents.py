@@ -117,6 +117,44 @@ def test_first_fault_of_an_agent_is_told() -> None:
     assert fault(change).field == "agents[1].states[1].heading"
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        set_state(1, x=NAN),
+        set_state(1, x=9e7),
+        set_state(1, velocity_x=0.0),
+        set_state(3, time=NOW - 2.0),
+        set_state(3, time=NOW + 1.0),
+        set_state(4, x=1000.0),
+    ],
+)
+def test_each_agent_is_told_its_own_first_fault(change: Change) -> None:
+    request = make_request(4)
+    for index in (1, 3):
+        change(request.agents[index])
+        request.agents[index].states[5].y = 500.0
+        request.agents[index].states[5].acceleration_y = 0.0
+    faults = read_agents(request, SETTINGS).faults
+    assert sorted(faults) == [1, 3]
+    assert faults[1].field.removeprefix("agents[1]") == faults[3].field.removeprefix("agents[3]")
+    assert faults[1].detail == faults[3].detail
+
+
+@pytest.mark.parametrize(
+    ("values", "field"), [([NAN] * 9, "time"), ([NOW, 0.0, 0.0, 0.0, 0.0], "velocity_y")]
+)
+def test_a_million_faults_are_not_put_into_words(values: list[float], field: str) -> None:
+    names = [each.name for each in pb.AgentState.DESCRIPTOR.fields]
+    state = pb.AgentState(**dict(zip(names, values, strict=False)))
+    request = pb.PredictRequest(time=NOW)
+    for index in range(200):
+        request.agents.add(id=f"a{index}", type=1, states=[state] * 500)
+    started = time.process_time()
+    faults = read_agents(request, SETTINGS).faults
+    assert time.process_time() - started < 1.0  # some 0.2 s
+    assert faults[199].field == f"agents[199].states[0].{field}"
+
+
 def test_too_many_states() -> None:
     request = make_request(1)
     agents = read_agents(request, Settings(max_states=5))

@@ -1,6 +1,7 @@
 """Whole calls without a transport: who forecasts whom, and what the answer says of it."""
 
 import asyncio
+import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any
@@ -11,8 +12,10 @@ import pytest
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.forecaster import Context, Protocol
+from model.scene import AgentType
 from service.core.dataplane import DataPlane, Phase
-from service.errors import BadField, BadFields, Unavailable, UnknownModel
+from service.core.incoming import Encoded
+from service.errors import BadField, BadFields, DeadlineExceeded, Overloaded, Unavailable, UnknownModel
 from service.settings import FALLBACK_MODEL, SettingsError
 from service.telemetry.metrics import Metrics
 from tests.service.fakes import FakeForecaster, registry
@@ -168,6 +171,9 @@ async def test_a_single_state_needs_its_velocity() -> None:
     known.states[0].velocity_x, known.states[0].velocity_y = 1.0, 0.0
     response = await predict(request, FakeForecaster())
     assert [(f.status, f.field) for f in response.forecasts] == [(INVALID, "agents[0].states"), (SHORT, "")]
+    assert response.forecasts[0].detail == (
+        "a single state needs its velocity, or another state 0.05 s to 1.05 s before it"
+    )
 
 
 async def test_a_bad_agent_costs_nobody_else() -> None:
@@ -245,6 +251,18 @@ async def test_map_reaches_the_model() -> None:
     assert seen is not None
     assert np.array_equal(seen.layers, layers)
     assert (seen.origin.tolist(), seen.pixels_per_meter) == ([-3.0, 7.0], 2.0)
+
+
+async def test_types_that_look_at_no_map_lack_none() -> None:
+    fake = FakeForecaster(uses_map=True, map_types=(AgentType.VEHICLE,))
+    request = make_request(2)
+    add_agent(request, "walker", PEDESTRIAN, y=20)
+    response = await predict(request, fake)
+    assert response.warnings == [
+        "fake uses the map, but none was given for 2 of 2 agents: it saw an unknown one"
+    ]
+    del request.agents[:2]
+    assert (await predict(request, fake)).warnings == []
 
 
 async def test_a_blind_forecast_needs_no_map() -> None:
@@ -394,6 +412,63 @@ async def test_warm_up_meets_every_shape() -> None:
     sizes = [agents for kind, agents, context, _ in fake.batches if context is Context.BLIND]
     assert sizes == [1, 2, 4, 6] * 2  # vehicles and pedestrians
     assert [agents for _, agents, _, _ in other.batches] == [1, 6] * 2
+
+
+def slow(seconds: float) -> Encoded:
+    """A request that takes so long to read."""
+
+    def read(_: bytes) -> pb.PredictRequest:
+        time.sleep(seconds)
+        return make_request(1)
+
+    return Encoded(b"", read, quick_bytes=-1)
+
+
+async def test_time_in_the_queue_is_all_the_time_before_the_model() -> None:
+    async with opened(FakeForecaster()) as plane:
+        response = await plane.predict(slow(0.2))
+    assert 0.2 <= response.timing.queue < 5
+
+
+async def test_the_deadline_holds_for_reading_too() -> None:
+    async with opened(FakeForecaster(), max_timeout=0.1) as plane:
+        started = time.monotonic()
+        with pytest.raises(DeadlineExceeded):
+            await plane.predict(slow(1.0))
+        assert time.monotonic() - started < 0.8
+
+
+async def test_the_earlier_deadline_holds() -> None:
+    async with opened(FakeForecaster(), max_timeout=5) as plane:
+        now = asyncio.get_running_loop().time()
+        for timeout, seconds in ((None, 5), (2, 2), (100, 5)):
+            with plane.accept(timeout) as call:
+                assert call.deadline - now == pytest.approx(seconds, abs=0.5)
+
+
+async def test_a_drain_waits_until_the_answer_is_out() -> None:
+    async with opened(FakeForecaster()) as plane:
+        with plane.accept() as call:
+            assert not await plane.drain(0.01)
+            with pytest.raises(Unavailable), plane.accept():
+                pass
+            assert (await plane.predict(make_request(1), call)).forecasts
+            assert not await plane.drain(0.01)  # the answer is still to be sent
+        assert await plane.drain(0.01)
+
+
+async def test_calls_are_refused_before_they_are_read() -> None:
+    fake = FakeForecaster()
+    async with opened(fake, max_agents=1, max_queue_agents=1) as plane:
+        fake.free.clear()
+        calls = [asyncio.create_task(plane.predict(make_request(1)))]
+        assert await asyncio.to_thread(fake.entered.wait, 10)
+        calls.append(asyncio.create_task(plane.predict(make_request(1))))
+        await asyncio.sleep(0.1)
+        with pytest.raises(Overloaded), plane.accept():
+            pass
+        fake.free.set()
+        await asyncio.gather(*calls)
 
 
 async def test_phases() -> None:

@@ -1,6 +1,7 @@
 """Map layers: what is accepted comes out bit for bit, and nothing else is accepted."""
 
 import struct
+import time
 import zlib
 
 import numpy as np
@@ -89,6 +90,50 @@ def test_a_png_that_holds_more_than_it_says_is_cut_off() -> None:
     assert decode(pb.LayerImage(png=bomb), 2, 2).shape == (3, 2, 2)
 
 
+def test_a_bomb_of_pixels_costs_nothing() -> None:
+    packer = zlib.compressobj(9)
+    squeezed = b"".join([*(packer.compress(bytes(2**20)) for _ in range(500)), packer.flush()])
+    bomb = _png_of(_header(2, 2), (b"IDAT", squeezed), (b"IEND", b""))
+    assert _seconds(bomb, 2, 2) < 0.1
+
+
+@pytest.mark.parametrize("name", [b"zTXt", b"iTXt", b"iCCP"])
+def test_texts_and_profiles_cost_nothing(name: bytes) -> None:
+    zeros = zlib.compress(bytes(2**20))
+    contents = {
+        b"zTXt": b"key\0\0" + zeros,
+        b"iTXt": b"key\0\1\0\0\0" + zeros,
+        b"iCCP": b"key\0\0" + zeros,
+    }
+    png = _png_of(_header(2, 2), *[(name, contents[name])] * 62, _pixels(2, 2), (b"IEND", b""))
+    assert _seconds(png, 2, 2) < 0.05  # 0.15 s where they are unpacked
+
+
+def test_what_is_no_pixels_changes_nothing() -> None:
+    png = _png_of(
+        _header(2, 2),
+        (b"PLTE", bytes(6)),
+        (b"acTL", bytes(8)),
+        (b"tEXt", b"key\0text"),
+        (b"tEXt", b"\0"),
+        _pixels(2, 2, 255),
+        (b"tIME", bytes(7)),
+        (b"IEND", b""),
+    )
+    assert decode(pb.LayerImage(png=png + b"and more"), 2, 2).all()
+
+
+def test_chunks_are_bounded() -> None:
+    pixels = _pixels(2, 2)
+    many = _png_of(_header(2, 2), *[(b"tEXt", b"")] * 300, pixels, (b"IEND", b""))
+    assert refusal(pb.LayerImage(png=many)) == "cannot be decoded: has more than 259 chunks"
+    assert refusal(pb.LayerImage(png=_png_of(_header(2, 2), pixels))) == "cannot be decoded: is cut off"
+    overlong = _png_of(_header(2, 2)) + b"\xff\xff\xff\xffIDAT"
+    assert refusal(pb.LayerImage(png=overlong)) == "cannot be decoded: is cut off"
+    rows = [(b"IDAT", pixels[1][index : index + 1]) for index in range(len(pixels[1]))]
+    assert not decode(pb.LayerImage(png=_png_of(_header(2, 2), *rows, (b"IEND", b"")))).any()
+
+
 @given(st.data())
 def test_broken_bytes_never_do_harm(data: st.DataObject) -> None:
     good = bytearray(png(layers(5, 5)))
@@ -102,10 +147,30 @@ def test_broken_bytes_never_do_harm(data: st.DataObject) -> None:
     assert decoded.max(initial=0) <= 1
 
 
-def _raw_png(width: int, height: int, pixels: bytes) -> bytes:
-    def chunk(name: bytes, body: bytes) -> bytes:
-        return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+def _seconds(png: bytes, rows: int, columns: int) -> float:
+    """CPU time that it takes to decode, the second time: the first loads what decodes."""
+    for _ in range(2):
+        started = time.process_time()
+        assert decode(pb.LayerImage(png=png), rows, columns).shape == (3, rows, columns)
+    return time.process_time() - started
 
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    parts = [chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(pixels)), chunk(b"IEND", b"")]
+
+def _header(width: int, height: int) -> tuple[bytes, bytes]:
+    return b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+
+
+def _pixels(width: int, height: int, value: int = 0) -> tuple[bytes, bytes]:
+    row = b"\0" + bytes([value]) * (3 * width)
+    return b"IDAT", zlib.compress(row * height)
+
+
+def _raw_png(width: int, height: int, pixels: bytes) -> bytes:
+    return _png_of(_header(width, height), (b"IDAT", zlib.compress(pixels)), (b"IEND", b""))
+
+
+def _png_of(*chunks: tuple[bytes, bytes]) -> bytes:
+    parts = [
+        struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+        for name, body in chunks
+    ]
     return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
