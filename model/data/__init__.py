@@ -1,0 +1,1 @@
+"""Recorded scenes: readers, and what training and evaluation make of them."""

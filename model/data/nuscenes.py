@@ -1,0 +1,221 @@
+"""Reader of nuScenes itself, through nuscenes-devkit.
+
+The devkit needs numpy < 2 and much else, so it is loaded when a reader is made and never before.
+"""
+
+import json
+import warnings
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from model.arrays import Floats
+from model.data.checks import check_pairs
+from model.data.nuscenes_map import VectorMap
+from model.data.scenes import DataError, Pair, SceneRecord, Track
+from model.scene import AgentType, Raster
+
+EGO = "ego"
+"""Id of the track of the car that recorded."""
+MARGIN = 50.0
+"""m of map around the tracks of a scene: a patch reaches 34.3 m."""
+
+_VERSIONS = {
+    "mini_train": "v1.0-mini",
+    "mini_val": "v1.0-mini",
+    "train": "v1.0-trainval",
+    "train_val": "v1.0-trainval",
+    "val": "v1.0-trainval",
+}
+_CATEGORIES = {
+    "vehicle.bicycle": AgentType.CYCLIST,
+    "vehicle.motorcycle": AgentType.CYCLIST,
+    "vehicle.": AgentType.VEHICLE,
+    "human.pedestrian.stroller": AgentType.UNKNOWN,
+    "human.pedestrian.wheelchair": AgentType.UNKNOWN,
+    "human.pedestrian.": AgentType.PEDESTRIAN,
+    "animal": AgentType.UNKNOWN,
+}
+"""Agent type by the beginning of the category, the first that fits. What moves like no type is UNKNOWN;
+what does not move by itself (barriers, cones, debris, racks) is no agent and left out."""
+
+
+class NuscenesReader:
+    """The data set with all its agents: parked vehicles, pedestrians, cyclists and the ego vehicle too.
+
+    Frames are the numbers of a scene's samples, nominally 0.5 s apart; tracks have instance tokens.
+    """
+
+    def __init__(self, dataroot: Path) -> None:
+        """
+        Args:
+            dataroot: holds ``v1.0-mini`` or ``v1.0-trainval``, and ``maps`` with the map expansion 1.3.
+
+        Raises:
+            ImportError: nuscenes-devkit is not installed.
+        """
+        try:
+            self._nuscenes = import_module("nuscenes.nuscenes").NuScenes
+            self._map_api = import_module("nuscenes.map_expansion.map_api").NuScenesMap
+            self._helper = import_module("nuscenes.prediction").PredictHelper
+            self._challenge = import_module("nuscenes.eval.prediction.splits").get_prediction_challenge_split
+        except ImportError as error:
+            fault = "reading nuScenes needs nuscenes-devkit (pip install nuscenes-devkit==1.2.0)"
+            raise ImportError(f"{fault}: {error}") from error
+        self._dataroot = dataroot
+        self._databases: dict[str, Any] = {}
+        self._maps: dict[str, VectorMap] = {}
+
+    @property
+    def splits(self) -> tuple[str, ...]:
+        """Splits of the prediction challenge; two of them on v1.0-mini."""
+        return tuple(_VERSIONS)
+
+    def scenes(self, split: str) -> Iterator[SceneRecord]:
+        """The scenes of a split that have pairs, in order of their names.
+
+        Raises:
+            DataError: no such split, or a file is missing or bad; names it.
+        """
+        if split not in _VERSIONS:
+            raise DataError(f"there is no split {split!r}; there are {', '.join(_VERSIONS)}")
+        database = self._database(_VERSIONS[split])
+        with _naming(database.table_root):
+            helper = self._helper(database)
+        asked = self._asked(database, split)
+        for scene in sorted(database.scene, key=lambda scene: str(scene["name"])):
+            if scene["token"] in asked:
+                yield self._record(database, helper, scene, asked[scene["token"]])
+
+    def _database(self, version: str) -> Any:
+        if version not in self._databases:
+            folder = self._dataroot / version
+            if not folder.is_dir():
+                raise DataError(f"{folder}: there is no such folder")
+            with _naming(folder):
+                self._databases[version] = self._nuscenes(version, str(self._dataroot), verbose=False)
+        return self._databases[version]
+
+    def _asked(self, database: Any, split: str) -> dict[str, list[tuple[str, str]]]:
+        """Instance and sample tokens of the pairs, by the token of their scene."""
+        file = self._dataroot / "maps" / "prediction" / "prediction_scenes.json"
+        with _naming(file), warnings.catch_warnings():
+            warnings.simplefilter("ignore", ResourceWarning)  # the devkit leaves the file open
+            tokens = self._challenge(split, str(self._dataroot))
+            asked: dict[str, list[tuple[str, str]]] = defaultdict(list)
+            for token in tokens:
+                instance, sample = token.split("_")
+                asked[database.get("sample", sample)["scene_token"]].append((instance, sample))
+        return asked
+
+    def _record(
+        self, database: Any, helper: Any, scene: dict[str, Any], asked: Sequence[tuple[str, str]]
+    ) -> SceneRecord:
+        where = f"{database.table_root}: {scene['name']}"
+        with _naming(where):
+            samples = list(_samples(database, scene))
+            tracks = _tracks(database, samples)
+            location = helper.get_map_name_from_sample_token(scene["first_sample_token"])
+            rows = {track.id: row for row, track in enumerate(tracks)}
+            frames = {sample["token"]: frame for frame, sample in enumerate(samples)}
+            pairs = [
+                Pair(rows[instance], frames[sample], f"{instance}_{sample}") for instance, sample in asked
+            ]
+        for track in tracks:
+            if not (np.isfinite(track.position).all() and np.isfinite(track.heading).all()):
+                raise DataError(f"{where}: agent {track.id} has a pose that is not finite")
+        pairs.sort(key=lambda pair: (pair.frame, pair.track))
+        check_pairs(where, tracks, pairs)
+        return SceneRecord(scene["name"], tracks, pairs, self._raster(location, tracks))
+
+    def _raster(self, location: str, tracks: Sequence[Track]) -> Raster:
+        if location not in self._maps:
+            file = self._dataroot / "maps" / "expansion" / f"{location}.json"
+            with _naming(file):
+                self._maps[location] = VectorMap(self._map_api(str(self._dataroot), location))
+        low = np.min([track.position.min(axis=0) for track in tracks], axis=0)
+        high = np.max([track.position.max(axis=0) for track in tracks], axis=0)
+        return self._maps[location].raster(low - MARGIN, high + MARGIN)
+
+
+def _samples(database: Any, scene: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    token = scene["first_sample_token"]
+    for _ in range(scene["nbr_samples"]):
+        sample = database.get("sample", token)
+        yield sample
+        token = sample["next"]
+
+
+def _tracks(database: Any, samples: Sequence[dict[str, Any]]) -> list[Track]:
+    """The ego vehicle, then the agents in order of their instance tokens."""
+    frames: dict[str, list[int]] = defaultdict(list)
+    poses: dict[str, list[list[float]]] = defaultdict(list)
+    types: dict[str, AgentType] = {EGO: AgentType.VEHICLE}
+
+    def add(name: str, frame: int, pose: dict[str, Any]) -> None:
+        if frames[name][-1:] == [frame]:
+            raise DataError(f"agent {name} is annotated twice in frame {frame}")
+        frames[name].append(frame)
+        poses[name].append([*pose["translation"][:2], *pose["rotation"]])
+
+    for frame, sample in enumerate(samples):
+        lidar = database.get("sample_data", sample["data"]["LIDAR_TOP"])
+        add(EGO, frame, database.get("ego_pose", lidar["ego_pose_token"]))
+        for token in sample["anns"]:
+            annotation = database.get("sample_annotation", token)
+            kind = _agent_type(annotation["category_name"])
+            if kind is not None:
+                types[annotation["instance_token"]] = kind
+                add(annotation["instance_token"], frame, annotation)
+
+    def track(name: str) -> Track:
+        pose = np.array(poses[name], dtype=np.float64)
+        number = np.array(frames[name], dtype=np.int64)
+        return Track(name, types[name], number, pose[:, :2].copy(), _yaw(pose[:, 2:]))
+
+    return [track(name) for name in (EGO, *sorted(types.keys() - {EGO}))]
+
+
+def _agent_type(category: str) -> AgentType | None:
+    return next((kind for start, kind in _CATEGORIES.items() if category.startswith(start)), None)
+
+
+def _yaw(quaternion: Floats) -> Floats:
+    """Direction, seen from above, of the turned x axis: [F, 4] (w, x, y, z) → [F], rad."""
+    w, x, y, z = quaternion.T
+    yaw: Floats = np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
+    return yaw
+
+
+@contextmanager
+def _naming(where: Path | str) -> Iterator[None]:
+    """Turns what the devkit and its tables raise into a ``DataError`` that names a file."""
+    try:
+        yield
+    except DataError as error:
+        raise DataError(f"{where}: {error}") from error
+    except json.JSONDecodeError as error:
+        raise DataError(f"{_broken(where)}: not JSON: {error}") from error
+    except FileNotFoundError as error:
+        raise DataError(f"{error.filename}: there is no such file") from error
+    except OSError as error:
+        raise DataError(f"{error.filename or where}: cannot be read: {error.strerror}") from error
+    except KeyError as error:
+        raise DataError(f"{where}: there is no record or field {error}") from error
+    except Exception as error:
+        raise DataError(f"{where}: {error}") from error
+
+
+def _broken(where: Path | str) -> Path | str:
+    """The file that is not JSON, of a folder of such."""
+    for file in sorted(Path(where).glob("*.json")):
+        try:
+            json.loads(file.read_bytes())
+        except ValueError:
+            return file
+    return where

@@ -1,0 +1,102 @@
+"""Map patches of agents of many scenes at once, cut from packed rasters on any device.
+
+The same patches as ``model.raster.cut_patches``; here all agents of a batch share one look-up.
+"""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from model.arrays import Floats, Ints
+from model.data.cache import Cache
+from model.data.packing import LAYERS
+from model.raster import COLUMNS_RIGHT, PATCH_PIXELS_PER_METER, PATCH_SIZE, ROWS_BEHIND
+
+_CHUNK = {"cpu": 8}
+"""Agents at once: on a CPU what they need stays in its cache."""
+_OTHER_CHUNK = 512
+_FAR = 1e4
+"""Pixels; an agent farther than that outside its raster sees as little as one that is just so far."""
+
+
+class PatchCutter:
+    """Cuts the patches of a cache's pairs."""
+
+    def __init__(self, cache: Cache, device: torch.device) -> None:
+        """
+        Args:
+            cache: gives rasters and poses.
+            device: where patches are cut; the rasters are copied there unless it is the CPU.
+        """
+        self._rasters = torch.from_numpy(cache.rasters).to(device)
+        rows_columns = cache.raster_shape[cache.scene]
+        scale = cache.raster_pixels_per_meter[cache.scene]
+        center = (cache.position - cache.raster_origin[cache.scene]) * scale[:, None]
+        center = np.clip(center, -_FAR, rows_columns + _FAR)
+        # Pixels are counted from the agent's own: small numbers, which float32 holds to 1e-5
+        base = np.floor(center).astype(np.int64)
+        stride = rows_columns[:, 1] + 2
+        start = cache.raster_start[cache.scene] + (base[:, 0] + 1) * stride + base[:, 1] + 1
+
+        def tensor(values: Floats | Ints, dtype: torch.dtype) -> Tensor:
+            return torch.from_numpy(np.ascontiguousarray(values)).to(device, dtype)
+
+        self._start = tensor(start, torch.int64)
+        self._stride = tensor(stride, torch.int64)
+        self._fraction = tensor(center - base, torch.float32)
+        self._low = tensor(-1 - base, torch.float32)
+        self._high = tensor(rows_columns - base, torch.float32)
+        zoom = scale / PATCH_PIXELS_PER_METER
+        directions = np.stack([zoom * np.cos(cache.heading), zoom * np.sin(cache.heading)], axis=-1)
+        self._ahead = tensor(directions, torch.float32)
+        index = torch.arange(PATCH_SIZE, dtype=torch.float32, device=device)
+        self._rows, self._columns = index - ROWS_BEHIND, index - COLUMNS_RIGHT
+
+    def __call__(self, indices: Tensor) -> Tensor:
+        """Patches of pairs.
+
+        Args:
+            indices: [n] int64, on the device.
+
+        Returns:
+            [n, 3, 100, 100] float32 in [-1, 1]: absent −1, present 1, bilinear between; −1 outside.
+        """
+        patches = torch.empty((len(indices), LAYERS, PATCH_SIZE, PATCH_SIZE), device=indices.device)
+        chunk = _CHUNK.get(indices.device.type, _OTHER_CHUNK)
+        for some, out in zip(indices.split(chunk), patches.split(chunk), strict=True):
+            self._cut(some, out)
+        return patches
+
+    def _cut(self, indices: Tensor, out: Tensor) -> None:
+        ahead = self._ahead[indices]
+        cos, sin = ahead[:, :1], ahead[:, 1:]
+        fraction, low, high = self._fraction[indices], self._low[indices], self._high[indices]
+
+        def axis(k: int, along: Tensor, across: Tensor) -> tuple[Tensor, Tensor]:
+            """Raster pixel before each patch pixel, counted from the agent's, and the rest: [n, 100, 100]."""
+            a = fraction[:, k, None] + self._rows * along
+            place = a[:, :, None] + (self._columns * across)[:, None]
+            # The border of zeros is all there is outside
+            place = torch.minimum(torch.maximum(place, low[:, k, None, None]), high[:, k, None, None])
+            whole = torch.minimum(place.floor(), high[:, k, None, None] - 1)
+            return whole, place.sub_(whole)
+
+        row, row_rest = axis(0, cos, -sin)
+        column, column_rest = axis(1, sin, cos)
+        stride = self._stride[indices][:, None, None]
+        index = row.to(torch.int64).mul_(stride).add_(column.to(torch.int64))
+        index += self._start[indices][:, None, None]
+        corners = [
+            self._rasters.index_select(0, corner.flatten()).view(index.shape)
+            for corner in (index, index + 1, index + stride, index + (stride + 1))
+        ]
+        for layer in range(LAYERS):
+            # ∓1 for a layer's bit
+            near, near_right, far, far_right = (
+                (corner & (1 << layer)).to(torch.float32) for corner in corners
+            )
+            first = torch.lerp(near, near_right, column_rest)
+            second = torch.lerp(far, far_right, column_rest)
+            scale = 2 / (1 << layer)
+            torch.lerp(first, second, row_rest, out=first)
+            torch.sub(first.mul_(scale), 1, out=out[:, layer])

@@ -1,0 +1,60 @@
+"""Augmentation by rotation: each agent's surroundings turned about its position now."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from model.forecaster import Features
+from model.standardization import HEADING
+
+_NEIGHBORS = "neighbors."
+
+
+def rotate(features: Features, future: Tensor, angle: Tensor) -> tuple[Features, Tensor]:
+    """Features as they were had each scene been turned about its agent.
+
+    ``origin`` stays, and so does the map patch, which lies in the agent's frame. Of standardised states it
+    takes that x and y have the same scale.
+
+    Args:
+        features: of n vehicles, from ``scene_features`` or ``Batches``; left as they are.
+        future: [n, T, 2], relative to the position now.
+        angle: [n], rad, counter-clockwise.
+
+    Returns:
+        New features, and the new future.
+    """
+    turned = dict(features)
+    matrix = _matrices(angle)
+    history = _turn_states(features["history"], matrix)
+    # Headings are fractions of π. The present one stays in [-1, 1) and the others run on from it; what was
+    # not observed stays zero
+    now = history[:, -1:, HEADING]
+    shift = torch.remainder(now + (angle / math.pi).to(now.dtype)[:, None] + 1, 2) - 1 - now
+    frames = torch.arange(history.shape[1], device=history.device)
+    history[..., HEADING] += torch.where(frames >= features["first"][:, None], shift, 0.0)
+    turned["history"] = history
+    turned["velocity"] = _turn(features["velocity"], matrix)
+    for name, states in features.items():
+        if name.startswith(_NEIGHBORS):  # their headings are relative to the own
+            turned[name] = _turn_states(states, matrix)
+    return turned, _turn(future, matrix)
+
+
+def _matrices(angle: Tensor) -> Tensor:
+    """[n, 2, 2], for row vectors: v @ R."""
+    cos, sin = torch.cos(angle), torch.sin(angle)
+    return torch.stack([torch.stack([cos, sin], dim=-1), torch.stack([-sin, cos], dim=-1)], dim=-2)
+
+
+def _turn(vectors: Tensor, matrix: Tensor) -> Tensor:
+    """Vectors [n, …, 2]."""
+    flat = vectors.reshape(len(vectors), -1, 2)
+    return torch.bmm(flat, matrix.to(vectors.dtype)).view(vectors.shape)
+
+
+def _turn_states(states: Tensor, matrix: Tensor) -> Tensor:
+    """State vectors [n, F, D]: positions, velocities and accelerations turned, the rest copied."""
+    vectors = states[..., :HEADING]
+    return torch.cat([_turn(vectors, matrix), states[..., HEADING:]], dim=-1)

@@ -1,0 +1,67 @@
+"""A recorded scene, whatever data set it is from."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Protocol as Interface
+
+from model.arrays import Floats, Ints
+from model.scene import AgentType, Raster
+
+
+class DataError(Exception):
+    """Recorded data is missing or makes no sense; the text names the file."""
+
+
+@dataclass(frozen=True)
+class Track:
+    """One agent over a scene, at 2 Hz."""
+
+    id: str
+    """Unique within the scene: the data set's instance token where it has one."""
+    type: AgentType
+    frames: Ints
+    """[F], ascending numbers of the scene's 2 Hz frames; gaps where it was not annotated."""
+    position: Floats
+    """[F, 2], m, ground frame."""
+    heading: Floats
+    """[F], rad."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """An agent and a frame that the prediction challenge asks for."""
+
+    track: int
+    """Index into the scene's tracks."""
+    frame: int
+    """Number of the 2 Hz frame that is the present."""
+    token: str = ""
+    """"instance_sample" as in the official lists; empty where the data has no tokens."""
+
+
+@dataclass(frozen=True)
+class SceneRecord:
+    """One scene."""
+
+    name: str
+    tracks: Sequence[Track]
+    pairs: Sequence[Pair]
+    """Of the split that was read, ordered by frame, then by track."""
+    raster: Raster
+
+
+class Reader(Interface):
+    """Gives the scenes of a data set."""
+
+    @property
+    def splits(self) -> tuple[str, ...]:
+        """Names that ``scenes`` takes."""
+        ...
+
+    def scenes(self, split: str) -> Iterator[SceneRecord]:
+        """The scenes of a split that have pairs, in order of their names.
+
+        Raises:
+            DataError: no such split, or a file is missing or bad; names it.
+        """
+        ...

@@ -1,0 +1,217 @@
+"""Caches of pairs: what is in them, and that only whole and fitting ones are used."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from model.data import cache_layout
+from model.data.cache import Cache, CacheKey, build_cache
+from model.data.protocols import frame_scene
+from model.data.scenes import DataError, Pair, SceneRecord
+from model.features import scene_features
+from model.forecaster import Context, Protocol
+from model.networks.config import BlindContext, NetworkConfig
+from model.scene import AgentType
+from tests.model.data.records import FixedReader, raster, record, track
+
+FRAMES = 5
+CONFIG = NetworkConfig(uses_map=False)
+RECORDS = record("scene-1", seed=1), record("scene-2", seed=2, vehicles=3)
+READER = FixedReader(*RECORDS)
+KEY = CacheKey.of(READER, "some", Protocol.CAUSAL, CONFIG, FRAMES)
+
+
+def _build(
+    folder: Path,
+    reader: FixedReader = READER,
+    protocol: Protocol = Protocol.CAUSAL,
+    config: NetworkConfig = CONFIG,
+) -> None:
+    build_cache(reader, "some", protocol, config, FRAMES, folder)
+
+
+@pytest.mark.parametrize("protocol", list(Protocol))
+def test_arrays_are_those_of_the_features(tmp_path: Path, protocol: Protocol) -> None:
+    _build(tmp_path / "cache", protocol=protocol)
+    cache = Cache.open(tmp_path / "cache")
+    assert len(cache) == sum(len(one.pairs) for one in RECORDS)
+    assert cache.manifest.scenes == ("scene-1", "scene-2")
+    row = 0
+    for number, whole in enumerate(RECORDS):
+        for pair in whole.pairs:
+            scene, tracks = frame_scene(whole, pair.frame, protocol, FRAMES)
+            target = np.flatnonzero(tracks == pair.track)
+            wanted = scene_features(scene, target, AgentType.VEHICLE, CONFIG, Context.FULL)
+            np.testing.assert_array_equal(cache.history[row], wanted["history"][0].numpy())
+            np.testing.assert_array_equal(cache.first[row], wanted["first"][0].numpy())
+            np.testing.assert_array_equal(cache.velocity[row], wanted["velocity"][0].numpy())
+            np.testing.assert_array_equal(cache.edge_mask[row], wanted["edge_mask"][0].numpy())
+            for kind in CONFIG.neighbor_types:
+                expected = wanted[f"neighbors.{kind.value}"][0].numpy()
+                np.testing.assert_allclose(cache.neighbors[kind][row], expected, rtol=1e-5, atol=1e-5)
+            one = whole.tracks[pair.track]
+            now = one.frames.tolist().index(pair.frame)
+            np.testing.assert_array_equal(cache.position[row], one.position[now])
+            assert cache.heading[row] == pytest.approx(one.heading[now])
+            relative = one.position[now + 1 : now + 13] - one.position[now]
+            np.testing.assert_allclose(cache.future[row], relative, rtol=1e-6)
+            assert (cache.scene[row], cache.track[row], cache.frame[row]) == (number, pair.track, pair.frame)
+            assert cache.token[row].decode() == pair.token
+            row += 1
+    for number, whole in enumerate(RECORDS):
+        again = cache.raster(number)
+        np.testing.assert_array_equal(again.layers, whole.raster.layers)
+        np.testing.assert_array_equal(again.origin, whole.raster.origin)
+        assert again.pixels_per_meter == whole.raster.pixels_per_meter
+
+
+def test_turn_is_the_total_change_of_heading(tmp_path: Path) -> None:
+    angle = np.linspace(3.0, 3.0 + np.pi, 17)
+    circle = 10 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    weave = 0.3 * np.sin(np.arange(17) * np.pi / 2)  # zero at both ends
+    tracks = [
+        track("round", circle, angle - np.pi / 2),
+        track("round the other way", circle, -angle),
+        track("weaving", circle, weave),
+    ]
+    whole = SceneRecord("scene-1", tracks, [Pair(i, 4) for i in range(3)], raster())
+    _build(tmp_path / "cache", FixedReader(whole))
+    np.testing.assert_allclose(Cache.open(tmp_path / "cache").turn, [np.pi, np.pi, 0.0], atol=1e-6)
+
+
+def test_data_without_tokens_and_a_network_without_neighbours(tmp_path: Path) -> None:
+    config = NetworkConfig(neighbor_types=(), uses_map=False)
+    _build(tmp_path / "cache", FixedReader(record(token=False)), config=config)
+    cache = Cache.open(tmp_path / "cache")
+    assert (cache.token == b"").all()
+    assert not cache.neighbors
+    assert not cache.edge_mask.any()
+
+
+def test_progress_is_told_of_each_scene(tmp_path: Path) -> None:
+    told: list[SceneRecord] = []
+    build_cache(READER, "some", Protocol.CAUSAL, CONFIG, FRAMES, tmp_path / "a/b/cache", told.append)
+    assert told == list(RECORDS)
+    assert [file.name for file in (tmp_path / "a/b").iterdir()] == ["cache"]
+
+
+def test_nobody_writes_to_the_files(tmp_path: Path) -> None:
+    _build(tmp_path / "cache")
+    Cache.open(tmp_path / "cache").history[:] = 7.0
+    assert not (Cache.open(tmp_path / "cache").history == 7.0).any()
+
+
+def test_methods_share_a_cache(tmp_path: Path) -> None:
+    _build(tmp_path / "cache")
+    other = NetworkConfig(modes=7, blind=BlindContext.NULL)
+    Cache.open(tmp_path / "cache", CacheKey.of(READER, "some", Protocol.CAUSAL, other, FRAMES))
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"protocol": Protocol.PAPER}, "protocol is causal, not paper"),
+        ({"split": "train"}, "split is some, not train"),
+        ({"history_frames": 9}, "history_frames is 5, not 9"),
+        ({"reader": "NuscenesReader"}, "reader is FixedReader, not NuscenesReader"),
+        ({"neighbor_types": ()}, "neighbor_types is"),
+    ],
+)
+def test_a_cache_of_something_else_is_refused(tmp_path: Path, change: dict[str, object], told: str) -> None:
+    _build(tmp_path / "cache")
+    with pytest.raises(DataError, match=told):
+        Cache.open(tmp_path / "cache", KEY.model_copy(update=change))
+
+
+def test_a_cache_made_by_other_code_is_stale(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _build(tmp_path / "cache")
+    monkeypatch.setattr(cache_layout, "_DERIVED_BY", (cache_layout,))
+    with pytest.raises(DataError, match="build the cache anew"):
+        Cache.open(tmp_path / "cache")
+
+
+def _manifest(change: dict[str, object]) -> Callable[[Path], None]:
+    def apply(folder: Path) -> None:
+        file = folder / "manifest.json"
+        file.write_text(json.dumps(json.loads(file.read_text()) | change))
+
+    return apply
+
+
+@pytest.mark.parametrize(
+    ("damage", "told"),
+    [
+        (lambda folder: (folder / "manifest.json").unlink(), "manifest.json: there is no such file"),
+        (lambda folder: (folder / "manifest.json").write_text("{"), "manifest.json: cannot be read"),
+        (lambda folder: (folder / "manifest.json").write_text("[1]"), r"manifest.json: "),
+        (_manifest({"format_version": 99}), "format version 99, not 1"),
+        (_manifest({"pairs": 0}), "manifest.json: pairs"),
+        (_manifest({"pairs": 3}), r"\.npy: holds .* not .*3"),
+        (_manifest({"more": 3}), "manifest.json: more"),
+        (lambda folder: (folder / "future.npy").unlink(), "future.npy: missing or damaged"),
+        (lambda folder: (folder / "future.npy").write_bytes(b"x"), "future.npy: missing or damaged"),
+        (lambda folder: np.save(folder / "first.npy", np.zeros(61)), "first.npy: holds"),
+        (lambda folder: (folder / "rasters.u8").unlink(), "rasters.u8: missing or damaged"),
+        (lambda folder: (folder / "rasters.u8").write_bytes(b"x"), "rasters.u8: has 1 bytes"),
+    ],
+)
+def test_a_damaged_cache_is_refused_and_the_file_named(
+    tmp_path: Path, damage: Callable[[Path], object], told: str
+) -> None:
+    _build(tmp_path / "cache")
+    damage(tmp_path / "cache")
+    with pytest.raises(DataError, match=told):
+        Cache.open(tmp_path / "cache")
+
+
+def test_a_new_cache_takes_the_place_of_the_old_one(tmp_path: Path) -> None:
+    _build(tmp_path / "cache")
+    _build(tmp_path / "cache", FixedReader(RECORDS[1]))
+    assert Cache.open(tmp_path / "cache").manifest.scenes == ("scene-2",)
+    assert [file.name for file in tmp_path.iterdir()] == ["cache"]
+
+
+def test_what_fails_half_way_leaves_the_old_cache_and_nothing_else(tmp_path: Path) -> None:
+    _build(tmp_path / "cache")
+    with pytest.raises(DataError, match=r"scene-9\.txt"):
+        _build(tmp_path / "cache", FixedReader(RECORDS[1], fails=True))
+    assert len(Cache.open(tmp_path / "cache").manifest.scenes) == 2
+    assert [file.name for file in tmp_path.iterdir()] == ["cache"]
+
+
+def test_a_folder_that_is_no_cache_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("years of work")
+    with pytest.raises(DataError, match="left alone"):
+        _build(tmp_path)
+    assert (tmp_path / "thesis.txt").read_text() == "years of work"
+
+
+def test_a_split_without_pairs(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="'none' has no pairs"):
+        build_cache(READER, "none", Protocol.CAUSAL, CONFIG, FRAMES, tmp_path / "cache")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("pair", "told"),
+    [
+        (Pair(0, 0), "a0 at frame 0 is asked for but has no history"),
+        (Pair(0, 12), "a0 at frame 12 is asked for but has no whole future"),
+        (Pair(0, 24), "a0 at frame 24 is asked for but not annotated"),
+        (Pair(1, 5), "a1 at frame 5 is asked for but not annotated"),
+        (Pair(1, 3), "a1 at frame 3 is asked for but has no whole future"),
+        (Pair(4, 6), "a4 at frame 6 is asked for but is a pedestrian"),
+    ],
+)
+def test_pairs_that_cannot_be_trained_on_are_refused(tmp_path: Path, pair: Pair, told: str) -> None:
+    with pytest.raises(DataError, match=told):
+        _build(tmp_path / "cache", FixedReader(replace(RECORDS[0], pairs=[pair])))
+
+
+def test_a_raster_that_would_be_coarsened_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="scene-1: a raster of 6 pixels per metre is too fine"):
+        _build(tmp_path / "cache", FixedReader(replace(RECORDS[0], raster=raster(scale=6.0))))
