@@ -1,0 +1,138 @@
+"""Every per-instance metric of one batch of forecasts, under names that stay."""
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from model.arrays import Floats
+from model.metrics import density, displacement, multimodal, offroad
+from model.mixture import TrajectoryMixture
+from model.scene import Raster
+
+SAMPLES: Final = 2000
+"""Trajectories that the paper draws for ADE-f, FDE-f and OffR-f."""
+
+_CHUNK_POINTS: Final = 1 << 18
+"""Sampled positions looked at at once."""
+
+
+def instance_metrics(
+    mixture: TrajectoryMixture,
+    truth: Floats,
+    rasters: Sequence[Raster | None] | None = None,
+    seeds: Sequence[int] | None = None,
+    *,
+    samples: int = SAMPLES,
+    draws: int = density.DRAWS,
+    noise_m: float = density.LABEL_NOISE_M,
+) -> dict[str, Floats]:
+    """Metrics of N forecasts, each [N]; their means over instances are the figures of the tables.
+
+    For h in 1 … 6 (as far as T reaches), k in 1, 5, 10, p in 50, 90, 99; "whole" is up to step T:
+
+    - ``ade_ml_{h}s_m``, ``fde_ml_{h}s_m``: m, of the most likely trajectory.
+    - ``min_ade_{k}_m``, ``min_fde_{k}_m``, ``miss_rate_{k}``: whole, as in nuscenes-devkit.
+    - ``nll``: nats, mean over the steps; ``nll_{h}s``: at that step; ``nll_joint``: whole trajectory. Of the
+      labelled position: the mixture is widened by ``noise_m`` (see ``density``).
+    - with rasters: ``off_road_ml``: 1 or 0, the most likely trajectory; NaN without a map.
+    - with seeds and ``samples``: ``ade_f_{h}s_m``, ``fde_f_{h}s_m``: m, mean over the samples; with rasters
+      also ``off_road_f``, share of the samples.
+    - with seeds and ``draws``: ``inside_{p}``: share of the steps at which the truth lies inside the p %
+      highest-density region of the widened mixture; ``inside_{p}_{h}s``: 1 or 0, at that step.
+
+    An instance with a step of the truth that is not finite gets NaN wherever that step counts.
+
+    Args:
+        mixture: of N agents, K modes, T steps; on any device.
+        truth: [N, T, 2], m, ground frame.
+        rasters: N maps (instances of a scene may share one), or None for no off-road rates.
+        seeds: N, one an instance, fixed by the instance and not by its place in a batch, so that figures do
+            not hang on batching; or None for no sampled metrics.
+        samples: S of ADE-f, FDE-f and OffR-f; 0 for none of them.
+        draws: for calibration; 0 for none.
+        noise_m: standard deviation of labelled positions, m, for likelihood and calibration; 0 for the plain
+            mixture.
+
+    Raises:
+        ValueError: sizes do not fit, or N is 0.
+    """
+    count, _, steps = mixture.means.shape[:3]
+    if not count:
+        raise ValueError("there are no instances to evaluate")
+    if truth.shape != (count, steps, 2):
+        raise ValueError(f"truth of {count} forecasts of {steps} steps cannot be {truth.shape}")
+    if seeds is not None and len(seeds) != count:
+        raise ValueError(f"{count} instances need as many seeds, not {len(seeds)}")
+    mixture = TrajectoryMixture(
+        mixture.log_weights.detach().cpu(),
+        mixture.means.detach().cpu(),
+        mixture.covariances.detach().cpu(),
+        mixture.origin.detach().cpu(),
+    )
+    most_likely = mixture.most_likely_trajectory().numpy()
+    result = _by_horizon("ml", displacement.displacement_m(most_likely, truth))
+    modes = mixture.world_means.numpy()
+    probabilities = mixture.weights.double().numpy()
+    for k in multimodal.TOP_K:
+        result[f"min_ade_{k}_m"] = multimodal.min_ade_m(modes, probabilities, truth, k)
+        result[f"min_fde_{k}_m"] = multimodal.min_fde_m(modes, probabilities, truth, k)
+        result[f"miss_rate_{k}"] = multimodal.missed(modes, probabilities, truth, k)
+    result |= _likelihood(mixture, truth, noise_m)
+    if rasters is not None:
+        result["off_road_ml"] = offroad.off_road_of_each(rasters, most_likely)
+    if seeds is not None and samples:
+        result |= _sampled(mixture, truth, rasters, seeds, samples)
+    if seeds is not None and draws:
+        result |= _calibration(mixture, truth, seeds, draws, noise_m)
+    return result
+
+
+def _by_horizon(kind: str, errors_m: Floats) -> dict[str, Floats]:
+    """ADE and FDE from errors [N, T]."""
+    result = {}
+    for h in displacement.horizons_within(errors_m.shape[1]):
+        result[f"ade_{kind}_{h}s_m"] = displacement.ade_m(errors_m, h)
+        result[f"fde_{kind}_{h}s_m"] = displacement.fde_m(errors_m, h)
+    return result
+
+
+def _likelihood(mixture: TrajectoryMixture, truth: Floats, noise_m: float) -> dict[str, Floats]:
+    steps = density.nll(mixture, truth, noise_m)
+    result = {"nll": steps.mean(axis=1), "nll_joint": density.joint_nll(mixture, truth, noise_m)}
+    for h in displacement.horizons_within(steps.shape[1]):
+        result[f"nll_{h}s"] = steps[:, displacement.horizon_steps(h) - 1]
+    return result
+
+
+def _sampled(
+    mixture: TrajectoryMixture,
+    truth: Floats,
+    rasters: Sequence[Raster | None] | None,
+    seeds: Sequence[int],
+    samples: int,
+) -> dict[str, Floats]:
+    """Some instances at a time: all samples of a large batch would fill the memory."""
+    parts = []
+    chunk = max(1, _CHUNK_POINTS // (samples * truth.shape[1]))
+    for start in range(0, len(truth), chunk):
+        some = slice(start, start + chunk)
+        drawn = mixture[some].sample(samples, seeds[some]).numpy()
+        part = _by_horizon("f", displacement.expected_displacement_m(drawn, truth[some]))
+        if rasters is not None:
+            part["off_road_f"] = offroad.expected_off_road(rasters[some], drawn)
+        parts.append(part)
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _calibration(
+    mixture: TrajectoryMixture, truth: Floats, seeds: Sequence[int], draws: int, noise_m: float
+) -> dict[str, Floats]:
+    rank = density.density_rank(mixture, truth, seeds, noise_m, draws)
+    result = {}
+    for level in density.LEVELS:
+        inside, percent = density.inside_region(rank, level), round(100 * level)
+        result[f"inside_{percent}"] = inside.mean(axis=1)
+        for h in displacement.horizons_within(truth.shape[1]):
+            result[f"inside_{percent}_{h}s"] = inside[:, displacement.horizon_steps(h) - 1]
+    return result
