@@ -32,8 +32,9 @@ format: install
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench: install  ## speed of the forward, against this process's own matmul rate
+bench: install  ## speed of the forward against this process's own matmul rate; start and memory of the server
 	$(BIN)/python -m model.bench
+	$(BIN)/python -m loadtest.startup
 
 proto: install  ## generate Python from proto/
 	$(PROTOC) -Iproto --python_out=proto --mypy_out=proto --grpc_python_out=proto \

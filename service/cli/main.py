@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli import convert, predict, serve
+from service.cli import convert, predict, serve, train
 
 app = typer.Typer(
     name="cab-forecast",
@@ -33,3 +33,4 @@ def _options(
 serve.register(app)
 predict.register(app)
 convert.register(app)
+train.register(app)

@@ -1,0 +1,1 @@
+"""Training the networks: objectives, schedules, the loop."""

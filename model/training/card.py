@@ -1,0 +1,65 @@
+"""Model cards: what a checkpoint was trained on, how far, and how good it is there."""
+
+from dataclasses import dataclass
+
+from model.forecaster import Protocol
+from model.training.config import TrainingConfig
+from model.training.state import Progress
+
+LICENSE = "trained on nuScenes: non-commercial use only (CC BY-NC-SA 4.0 and the nuScenes terms of use)"
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where a checkpoint comes from."""
+
+    data: str
+    """The data set and its pairs, in words."""
+    protocol: Protocol
+    validation: str
+    """The split that the figures are of, in words."""
+    command: str
+    machine: str
+
+
+def model_card(
+    config: TrainingConfig, origin: Origin, progress: Progress, version: str, figures: dict[str, float]
+) -> str:
+    """Markdown.
+
+    Args:
+        config: of the run.
+        origin: of the data and the run.
+        progress: where the run stands; the checkpoint is its best epoch.
+        version: of the checkpoint.
+        figures: of the best epoch by name.
+    """
+    inputs = {
+        Protocol.CAUSAL: "causal: states from the past alone, as a live service has them",
+        Protocol.PAPER: "paper: central differences over whole tracks, so the state now contains the next "
+        "positions. For comparison with published tables only: on live states it is less accurate",
+    }
+    rows = "\n".join(f"| {name} | {value:.4g} |" for name, value in sorted(figures.items()))
+    return f"""# {config.method.value} {version}
+
+{config.description}
+
+- **Data**: {origin.data}.
+- **Protocol**: {inputs[origin.protocol]}.
+- **Forecasts** vehicles, 6 s ahead at 2 Hz, as {config.network.modes} modes; uses up to
+  {config.history_frames} frames of history.
+- **Training**: best of {progress.epoch} epochs (epoch {progress.best_epoch}; settings ask for
+  {config.epochs}), batches of {config.batch_size}, learning rate {config.learning_rate:g},
+  seed {config.seed}; {progress.seconds / 60:.0f} minutes on {origin.machine}.
+- **Command**: `{origin.command}`
+- **Licence**: {LICENSE}.
+
+## Figures
+
+On {origin.validation}, {origin.protocol.value} protocol. The epoch was chosen by the FDE of the likeliest
+mode on this same split.
+
+| figure | value |
+|---|---|
+{rows}
+"""

@@ -1,0 +1,110 @@
+"""The terms of a conditional variational autoencoder's objective, in one context.
+
+Trajectron++ (Salzmann et al. 2020), section 4.4: the evidence lower bound with a mutual-information term
+(InfoVAE, Zhao et al. 2019).
+"""
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from model.forecaster import Context, Features
+from model.mixture import guarded_log_density
+from model.networks.network import AgentNetwork
+from model.standardization import FUTURE_POSITION_SCALE
+
+LEAST_KL = 0.07
+"""nats; below it the divergence is not pressed further."""
+
+
+class ContextTerms(NamedTuple):
+    """What one context contributes, before weights."""
+
+    prior_logits: Tensor
+    """[N, K], of p(z | x), clipped."""
+    posterior_logits: Tensor
+    """[N, K], of q(z | x, y), clipped."""
+    step_density: Tensor
+    """[N, K, T], log-density of the true position under each mode, 1/m² inside the log."""
+
+    @property
+    def log_prior(self) -> Tensor:
+        """[N, K], log p(z | x)."""
+        return F.log_softmax(self.prior_logits, -1)
+
+    @property
+    def log_posterior(self) -> Tensor:
+        """[N, K], log q(z | x, y)."""
+        return F.log_softmax(self.posterior_logits, -1)
+
+
+def context_terms(
+    network: AgentNetwork,
+    features: Features,
+    future: Tensor,
+    context: Context,
+    logit_clip: float,
+    detach_encoding: bool = False,
+    sample_controls: bool = True,
+) -> ContextTerms:
+    """Runs one context of the network in training.
+
+    Args:
+        network: in training mode for dropout.
+        features: of N agents.
+        future: [N, T, 2], m, relative to now.
+        context: full or blind.
+        logit_clip: bound of the latent logits.
+        detach_encoding: whether the gradient stops at the encoding.
+        sample_controls: whether the decoder feeds back samples of its controls instead of their means.
+    """
+    encoding = network.encode(features, context)
+    if detach_encoding:
+        encoding = encoding.detach()
+    scale = FUTURE_POSITION_SCALE[network.agent_type]
+    prior = network.prior(encoding, context).clamp(-logit_clip, logit_clip)
+    posterior = network.posterior(encoding, features, future / scale, context).clamp(-logit_clip, logit_clip)
+    positions = network.decode(encoding, features, context, future.shape[1], sample_controls)
+    density = guarded_log_density(future[:, None] - positions.mean, positions.covariance)
+    return ContextTerms(prior, posterior, density)
+
+
+def log_likelihood(
+    log_weights: Tensor, step_density: Tensor, least: float | None, most: float | None
+) -> Tensor:
+    """log p(y | x) with the modes weighted at every step, each step clamped, summed over the steps: [N].
+
+    Args:
+        log_weights: [N, K]; in training those of q(z | x, y).
+        step_density: [N, K, T].
+        least: bound of a step's log-likelihood from below; None: none.
+        most: from above.
+    """
+    steps = torch.logsumexp(log_weights[:, :, None] + step_density, dim=1)
+    if least is not None or most is not None:
+        steps = steps.clamp(least, most)
+    return steps.sum(dim=-1)
+
+
+def divergence(log_q: Tensor, log_p: Tensor) -> Tensor:
+    """KL(q ‖ p), averaged over the batch: [].
+
+    Args:
+        log_q: [N, K].
+        log_p: [N, K].
+    """
+    return F.kl_div(log_p, log_q, reduction="batchmean", log_target=True)
+
+
+def clamped_divergence(log_q: Tensor, log_p: Tensor) -> Tensor:
+    """KL(q ‖ p), averaged over the batch and then bounded from below (free bits)."""
+    return divergence(log_q, log_p).clamp_min(LEAST_KL)
+
+
+def mutual_information(log_prior: Tensor) -> Tensor:
+    """I(z; x) under the prior: entropy of the batch-mean p(z | x) minus the mean entropy: []."""
+    prior = log_prior.exp()
+    mean = prior.mean(dim=0)
+    return -torch.xlogy(mean, mean).sum() + (prior * log_prior).sum(dim=-1).mean()

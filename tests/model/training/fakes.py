@@ -1,0 +1,47 @@
+"""Pairs made up for training tests."""
+
+import torch
+from torch import Tensor
+
+from model.bench import features
+from model.forecaster import Features
+from model.networks.config import BlindContext, NetworkConfig
+from model.training.config import Method, TrainingConfig
+
+
+class MadeUpPairs:
+    """Vehicles that go on at their velocity; the network can learn that."""
+
+    def __init__(self, pairs: int) -> None:
+        self._features = features(pairs)
+        ahead = 0.5 * torch.arange(1, 13)
+        self._future = self._features["velocity"][:, None, :] * ahead[:, None]
+        self._turned = torch.linspace(0, 1, pairs)
+
+    def __len__(self) -> int:
+        return len(self._future)
+
+    @property
+    def turned(self) -> Tensor:
+        """[P], a third of them curved."""
+        return self._turned
+
+    def batch(self, indices: Tensor, turns: Tensor | None = None) -> tuple[Features, Tensor]:
+        """As a BatchSource; turning is left out."""
+        return {name: t[indices] for name, t in self._features.items()}, self._future[indices]
+
+
+def small_config(method: Method = Method.CAB, epochs: int = 2, **changes: object) -> TrainingConfig:
+    """A run of seconds."""
+    blind = {Method.CAB: BlindContext.NULL, Method.TRAJECTRON: BlindContext.NONE}.get(
+        method, BlindContext.OWN
+    )
+    values: dict[str, object] = {
+        "method": method,
+        "description": "A test.",
+        "network": NetworkConfig(blind=blind, modes=5),
+        "learning_rate": 0.003,
+        "epochs": epochs,
+        "batch_size": 16,
+    }
+    return TrainingConfig.model_validate(values | changes)

@@ -1,0 +1,29 @@
+"""Schedules."""
+
+import math
+
+import pytest
+
+from model.training.annealing import KL_WEIGHT, Z_LOGIT_CLIP, Sigmoid, learning_rate
+
+
+def test_a_sigmoid_is_halfway_at_its_center_and_goes_from_start_to_end() -> None:
+    curve = Sigmoid(2.0, 10.0, center=100, width=10)
+    assert curve(100) == pytest.approx(6.0)
+    assert curve(0) == pytest.approx(2.0, abs=1e-3)
+    assert curve(1000) == pytest.approx(10.0)
+    assert curve(110) == pytest.approx(2 + 8 / (1 + math.exp(-1)))
+
+
+def test_the_released_schedules() -> None:
+    assert KL_WEIGHT(400) == pytest.approx(50.0)
+    assert KL_WEIGHT(0) < 2
+    assert Z_LOGIT_CLIP(300) == pytest.approx(2.525)
+    assert Z_LOGIT_CLIP(0) < 0.1
+    assert Z_LOGIT_CLIP(3000) == pytest.approx(5.0)
+
+
+def test_the_learning_rate_decays_to_a_floor() -> None:
+    assert learning_rate(0.003, 0) == 0.003
+    assert learning_rate(0.003, 1) == pytest.approx(0.003 * 0.9999)
+    assert learning_rate(0.003, 10**6) == 1e-5

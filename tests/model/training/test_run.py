@@ -1,0 +1,93 @@
+"""From data to a checkpoint that serves."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from model.data.scenes import DataError
+from model.forecaster import Protocol
+from model.registry import Registry
+from model.training import run as run_module
+from model.training.config import Method, TrainingError
+from model.training.logs import RunLog
+from model.training.run import Run, Source, parse_data, parse_protocol
+from model.training.state import Progress
+from tests.model.data.records import FixedReader, record
+from tests.model.training.fakes import small_config
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """A run over two made-up scenes."""
+    reader = FixedReader(record(), record("scene-2", seed=1))
+    monkeypatch.setitem(run_module.READERS, "made", lambda path: reader)
+    source = Source("made", tmp_path, "some", "some", Protocol.CAUSAL)
+    return Run(small_config(Method.CAB, epochs=2), source, tmp_path / "run", tmp_path / "cache", "1.2.3")
+
+
+def go(run: Run) -> tuple[Path, list[Progress]]:
+    """Runs it; where the checkpoint is, and each epoch's progress."""
+    reports: list[Progress] = []
+    folder = run.train(
+        "cab-forecast train cab",
+        lambda progress, figures: reports.append(progress),
+        lambda *_: None,
+        lambda _: None,
+    )
+    return folder, reports
+
+
+def test_a_run_ends_in_a_checkpoint_that_the_registry_loads(run: Run) -> None:
+    folder, reports = go(run)
+    assert [progress.epoch for progress in reports] == [1, 2]
+    models = folder.parent.parent / "models"
+    models.mkdir()
+    folder.rename(models / "cab")
+    info = Registry.load(models).get("cab").info
+    assert info.version == "1.2.3"
+    assert info.protocol is Protocol.CAUSAL
+    assert np.isfinite(info.benchmark["fde_ml_6s_m"])
+    assert {"ade_f_6s_m", "off_road_ml", "inside_90", "nll"} <= info.benchmark.keys()
+    card = (models / "cab/README.md").read_text()
+    for said in ("causal", "seed 0", "cab-forecast train cab", "non-commercial", "fde_ml_6s_m"):
+        assert said in card
+
+
+def test_an_interrupted_run_goes_on(run: Run) -> None:
+    go(replace(run, config=run.config.model_copy(update={"epochs": 1})))
+    _, reports = go(run)
+    assert [progress.epoch for progress in reports] == [2]
+    rows = RunLog(run.out).rows()
+    assert [row["epoch"] for row in rows] == ["1", "2"]
+    assert all(float(row["loss"]) == float(row["loss"]) for row in rows)
+
+
+def test_a_paper_checkpoint_is_served_on_an_explicit_opt_in_only(run: Run) -> None:
+    folder, _ = go(replace(run, source=replace(run.source, protocol=Protocol.PAPER)))
+    models = folder.parent.parent / "models"
+    models.mkdir()
+    folder.rename(models / "cab")
+    with pytest.raises(Exception, match="paper protocol"):
+        Registry.load(models)
+    assert Registry.load(models, allow_paper=True).get("cab").info.protocol is Protocol.PAPER
+
+
+def test_what_cannot_be_trained_on_is_said(run: Run, tmp_path: Path) -> None:
+    with pytest.raises(TrainingError, match="KIND:PATH"):
+        parse_data("nowhere")
+    with pytest.raises(TrainingError, match="no protocol 'best'"):
+        parse_protocol("best")
+    with pytest.raises(DataError):
+        go(replace(run, source=replace(run.source, train_split="none")))
+    kind, path = parse_data(f"nuscenes_pred:{tmp_path / 'nothing'}")
+    with pytest.raises(DataError, match="nothing"):
+        go(replace(run, source=replace(run.source, kind=kind, path=path, train_split="train")))
+
+
+def test_a_log_replaces_the_rows_of_epochs_done_again(tmp_path: Path) -> None:
+    log = RunLog(tmp_path)
+    for epoch, loss in ((1, 3.0), (2, 2.0), (2, 1.0)):
+        log.add(Progress(epoch, epoch * 10, epoch, loss, 1.0), {"loss": loss})
+    assert [(row["epoch"], row["loss"]) for row in log.rows()] == [("1", "3.0"), ("2", "1.0")]
