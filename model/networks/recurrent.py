@@ -76,12 +76,14 @@ class GRUCell(nn.Module):
         """The next hidden state.
 
         Args:
-            reset_update_in: [N, 2·hidden_size], what the input adds to these gates, both biases included.
+            reset_update_in: [N, 2·hidden_size], what the input adds to these gates, both biases included;
+                overwritten.
             new_in: [N, hidden_size], what the input adds to the candidate, its bias included.
             hidden: [N, hidden_size].
         """
         size = self.hidden_size
-        gates = torch.addmm(reset_update_in, hidden, self.weight_hh[: 2 * size].T).sigmoid_()
+        gates = reset_update_in.addmm_(hidden, self.weight_hh[: 2 * size].T).sigmoid_()
         candidate = F.linear(hidden, self.weight_hh[2 * size :], self.bias_hh[2 * size :])
-        new = torch.addcmul(new_in, gates[:, :size], candidate).tanh_()
+        # tanh(x) = 2σ(2x) − 1: on CPUs the sigmoid takes a third of tanh's time
+        new = torch.sigmoid(2 * torch.addcmul(new_in, gates[:, :size], candidate)) * 2 - 1
         return torch.lerp(new, hidden, gates[:, size:])
