@@ -6,13 +6,13 @@ event loop, so there are no locks.
 """
 
 import asyncio
-import functools
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import structlog
 import torch
@@ -20,10 +20,13 @@ import torch
 from model.forecaster import Context, Features, Forecaster, agent_count, join
 from model.mixture import TrajectoryMixture
 from model.scene import AgentType
+from service.core.threads import set_forward_threads
 from service.errors import DeadlineExceeded, Internal, Overloaded, Unavailable
 from service.telemetry.metrics import Metrics
 
 _log = structlog.get_logger(__name__)
+
+_T = TypeVar("_T")
 
 _MIN_RETRY = 0.05
 _MAX_RETRY = 10.0
@@ -118,8 +121,9 @@ class Batcher:
         self._waiting = 0
         self._rate = _FIRST_RATE
         self._wake = asyncio.Event()
-        initializer = functools.partial(torch.set_num_threads, threads) if threads else None
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="forward", initializer=initializer)
+        self._thread = ThreadPoolExecutor(
+            1, thread_name_prefix="forward", initializer=set_forward_threads, initargs=(threads,)
+        )
         self._worker: asyncio.Task[None] | None = None
 
     @property
@@ -203,8 +207,11 @@ class Batcher:
 
     async def run_in_model_thread(self, job: Job) -> None:
         """Runs a job past the queue, for warm-up."""
-        loop = asyncio.get_running_loop()
-        await loop.run_in_executor(self._thread, _forward, job, [job.features], job.steps)
+        await self.call_in_model_thread(_forward, job, [job.features], job.steps)
+
+    async def call_in_model_thread(self, function: Callable[..., _T], *arguments: object) -> _T:
+        """Calls a function in the forward's thread, past the queue."""
+        return await asyncio.get_running_loop().run_in_executor(self._thread, function, *arguments)
 
     def _entries(self, job: Job, deadline: float, admission: Admission) -> list[_Entry]:
         """The job in parts that fit a batch."""

@@ -23,6 +23,7 @@ from service.core.encode import Result, encode, finite
 from service.core.incoming import Encoded, Reader
 from service.core.options import read_options
 from service.core.plan import Draft, Group, Plan, check_strict, fall_back, make_plan
+from service.core.threads import set_helper_threads
 from service.core.warmup import warm_up
 from service.errors import BadField, DeadlineExceeded, Fault, Unavailable
 from service.settings import Settings
@@ -79,7 +80,9 @@ class DataPlane:
             settings.max_batch_agents, settings.max_queue_agents, metrics, threads=settings.threads
         )
         self._threads = ThreadPoolExecutor(
-            min(_MAX_WORKERS, (os.cpu_count() or 1) + 1), thread_name_prefix="calls"
+            min(_MAX_WORKERS, (os.cpu_count() or 1) + 1),
+            thread_name_prefix="calls",
+            initializer=set_helper_threads,
         )
         self._reader = Reader(self._threads)
         self._phase = Phase.STARTING
@@ -219,7 +222,7 @@ class DataPlane:
     ) -> tuple[list[Result], list[Outcome]]:
         """Runs the plan; agents whose forecast is not finite get another one from the fallback."""
         outcomes = await self._batcher.run([group.job for group in plan.groups], deadline, admission)
-        results, broken = _sift(plan.groups, outcomes)
+        results, broken = await self._in_thread(_sift, plan.groups, outcomes)
         if not broken:
             return results, outcomes
         self._reassign(plan, broken)
@@ -227,7 +230,7 @@ class DataPlane:
             plan.add_groups, [draft for draft in broken if draft.status != pb.FORECAST_STATUS_INVALID]
         )
         more = await self._batcher.run([group.job for group in again], deadline, admission)
-        rescued, lost = _sift(again, more)
+        rescued, lost = await self._in_thread(_sift, again, more)
         self._reassign(plan, lost)
         check_strict(plan)
         return [*results, *rescued], [*outcomes, *more]

@@ -1,6 +1,5 @@
 """First forwards, made before anyone waits for them: they allocate, compile and cache."""
 
-import asyncio
 import time
 
 import numpy as np
@@ -35,7 +34,7 @@ async def warm_up(batcher: Batcher, catalog: Catalog, max_batch_agents: int) -> 
         sizes = _sizes(max_batch_agents) if main else sorted({1, max_batch_agents})
         for kind in info.agent_types:
             for context in (Context.FULL, Context.BLIND) if info.supports_blind else (Context.FULL,):
-                for job in await asyncio.to_thread(_jobs, forecaster, kind, context, sizes):
+                for job in await batcher.call_in_model_thread(_jobs, forecaster, kind, context, sizes):
                     await batcher.run_in_model_thread(job)
                     forwards += 1
     _log.info("warmed up", forwards=forwards, seconds=round(time.perf_counter() - started, 3))
