@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 import torch.distributed
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from model.cvae import CvaeNetworks
@@ -28,6 +29,8 @@ Tick = Callable[[int, int], None]
 
 SCORE = "fde_ml_6s_m"
 """The figure that the best epoch is chosen by, the smaller the better."""
+BEST_FILE = "best.safetensors"
+"""Parameters of the best epoch, in the run's folder."""
 
 
 class Trainer:
@@ -79,9 +82,7 @@ class Trainer:
 
     def best(self) -> dict[str, Tensor]:
         """Parameters of the best epoch so far, on the CPU."""
-        from safetensors.torch import load_file  # noqa: PLC0415 (light, and only at the end)
-
-        return load_file(self._folder / "best.safetensors")
+        return load_file(self._folder / BEST_FILE)
 
     def _judge(self) -> dict[str, float]:
         self.networks.eval()
@@ -89,17 +90,15 @@ class Trainer:
         score = figures[SCORE]
         if self.progress.best_score is None or score < self.progress.best_score:
             self.progress = replace(self.progress, best_epoch=self.progress.epoch, best_score=score)
-            self._keep("best.safetensors")
+            self._keep_best()
         return figures
 
-    def _keep(self, name: str) -> None:
-        from safetensors.torch import save_file  # noqa: PLC0415
-
+    def _keep_best(self) -> None:
         self._folder.mkdir(parents=True, exist_ok=True)
         tensors = {k: v.detach().cpu().contiguous() for k, v in self.networks.state_dict().items()}
-        temporary = self._folder / f"{name}.new"
+        temporary = self._folder / f"{BEST_FILE}.new"
         save_file(tensors, temporary)
-        temporary.replace(self._folder / name)
+        temporary.replace(self._folder / BEST_FILE)
 
     def _epoch(self, tick: Tick) -> dict[str, float]:
         """One epoch of steps; returns the mean of each term, the learning rate and the seconds."""
