@@ -16,9 +16,10 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError, mod
 from safetensors import SafetensorError
 from torch import Tensor
 
+from model.covernet import CoverNetForecaster
 from model.cvae import CvaeForecaster
 from model.forecaster import Forecaster, ModelInfo
-from model.networks.config import BlindContext, NetworkConfig
+from model.networks.config import AnyNetworkConfig, CoverNetConfig
 
 FORMAT_VERSION = 1
 """Of the folder's layout and of config.json; what reads one version reads no other."""
@@ -49,8 +50,7 @@ class CheckpointConfig(BaseModel):
 
     format_version: Annotated[int, AfterValidator(_format_version)]
     info: ModelInfo
-    network: NetworkConfig
-    """``kind`` tells networks apart; another one is another member of a union here."""
+    network: AnyNetworkConfig
     tensors_sha256: str
     """Of model.safetensors, so that files of two checkpoints are never mixed."""
 
@@ -71,8 +71,10 @@ class CheckpointConfig(BaseModel):
             "modes": (info.modes, network.modes),
             "uses_map": (info.uses_map, network.uses_map),
             "uses_neighbors": (info.uses_neighbors, bool(network.neighbor_types)),
-            "supports_blind": (info.supports_blind, network.blind is not BlindContext.NONE),
+            "supports_blind": (info.supports_blind, network.supports_blind),
         }
+        if isinstance(network, CoverNetConfig):
+            pairs["steps"] = (info.steps, network.steps)
         wrong = [name for name, (told, true) in pairs.items() if told != true]
         if wrong:
             raise ValueError(f"info does not fit the network in {', '.join(wrong)}")
@@ -85,7 +87,7 @@ class Checkpoint:
 
     folder: Path
     info: ModelInfo
-    network: NetworkConfig
+    network: AnyNetworkConfig
     tensors: Mapping[str, Tensor]
 
     def forecaster(self) -> Forecaster:
@@ -95,13 +97,15 @@ class Checkpoint:
             CheckpointError: tensors are missing, unexpected or of the wrong shape.
         """
         try:
+            if isinstance(self.network, CoverNetConfig):
+                return CoverNetForecaster(self.info, self.network, self.tensors)
             return CvaeForecaster(self.info, self.network, self.tensors)
         except ValueError as error:
             raise CheckpointError(self.folder / TENSORS_FILE, str(error)) from error
 
 
 def save_checkpoint(
-    folder: Path, info: ModelInfo, network_config: NetworkConfig, tensors: Mapping[str, Tensor], card: str
+    folder: Path, info: ModelInfo, network_config: AnyNetworkConfig, tensors: Mapping[str, Tensor], card: str
 ) -> None:
     """Writes a checkpoint; its three files are replaced where they exist.
 

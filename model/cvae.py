@@ -2,38 +2,23 @@
 
 from collections.abc import Mapping
 
-import numpy as np
-import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from model.arrays import Ints
-from model.features import scene_features
-from model.forecaster import Context, Features, Forecaster, ModelInfo
-from model.mixture import TrajectoryMixture
+from model.forecaster import ModelInfo
+from model.network_forecaster import NetworkForecaster, Networks
 from model.networks.config import NetworkConfig
 from model.networks.network import AgentNetwork
-from model.scene import AgentType, Scene
-from model.single import require_observed
-
-SMALLEST_VARIANCE = 1e-6
-"""m²; no forecast is surer than that in any direction."""
 
 
-class CvaeNetworks(nn.ModuleDict):
-    """One network an agent type, by its name: the parameters of a checkpoint."""
+class CvaeNetworks(Networks[AgentNetwork]):
+    """The networks of a CVAE."""
 
     def __init__(self, config: NetworkConfig) -> None:
-        super().__init__({kind.value: AgentNetwork(config, kind) for kind in config.agent_types})
-
-    def of(self, agent_type: AgentType) -> AgentNetwork:
-        """The network of that type."""
-        network = self[agent_type.value]
-        assert isinstance(network, AgentNetwork)  # noqa: S101 (for the type checker; made above)
-        return network
+        super().__init__(config, {kind: AgentNetwork(config, kind) for kind in config.agent_types})
 
 
-class CvaeForecaster(Forecaster):
-    """CAB, Trajectron++, Reweight or RUBiZ, depending on the weights.
+class CvaeForecaster(NetworkForecaster[CvaeNetworks]):
+    """CAB, Trajectron++, Reweight, RUBiZ or HalentNet, depending on the weights.
 
     Args:
         info: what is known of the model.
@@ -45,63 +30,4 @@ class CvaeForecaster(Forecaster):
     """
 
     def __init__(self, info: ModelInfo, config: NetworkConfig, tensors: Mapping[str, Tensor]) -> None:
-        self.info = info
-        self.config = config
-        with torch.device("meta"):  # nothing is drawn that the tensors replace
-            self.networks = CvaeNetworks(config)
-        _check(dict(self.networks.state_dict()), tensors)
-        self.networks.load_state_dict(dict(tensors), assign=True)
-        self.networks.eval().requires_grad_(False)
-
-    def requires_heading(self, agent_type: AgentType) -> bool:
-        """Vehicles only: a pedestrian's state has no heading, and it sees no map."""
-        return agent_type is AgentType.VEHICLE
-
-    def looks_at_map(self, agent_type: AgentType) -> bool:
-        """Vehicles only, if at all."""
-        return self.config.looks_at_map(agent_type)
-
-    def prepare(self, scene: Scene, targets: Ints, context: Context = Context.FULL) -> Features:
-        agent_type = scene.types[int(targets[0])]
-        states = scene.states.last_frames(self.info.history_frames)
-        require_observed(states, targets)
-        if self.requires_heading(agent_type) and np.isnan(states.heading[targets, -1]).any():
-            raise ValueError("an agent to be forecast has no heading")
-        scene = Scene(scene.types, states, scene.raster, scene.patches)
-        return scene_features(scene, targets, agent_type, self.config, context)
-
-    @torch.inference_mode()
-    def forecast(
-        self,
-        features: Features,
-        agent_type: AgentType,
-        context: Context = Context.FULL,
-        steps: int | None = None,
-    ) -> TrajectoryMixture:
-        network = self.networks.of(agent_type)
-        log_weights, positions = network(features, context, steps or self.info.steps)
-        return TrajectoryMixture(
-            log_weights, positions.mean, _positive(positions.covariance), features["origin"]
-        )
-
-
-def _positive(covariances: Tensor) -> Tensor:
-    """Strictly positive definite covariances: what is told from one control alone has no width across.
-
-    Adds a variance of (1 mm)² and a millionth of the trace, which is above float32's rounding.
-    """
-    trace = covariances.diagonal(dim1=-2, dim2=-1).sum(-1)
-    width = SMALLEST_VARIANCE + 1e-6 * trace
-    return covariances + width[..., None, None] * torch.eye(2, dtype=covariances.dtype)
-
-
-def _check(expected: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> None:
-    faults = [f"{name} is missing" for name in expected if name not in given]
-    faults += [f"{name} is not of this network" for name in given if name not in expected]
-    for name in expected.keys() & given.keys():
-        if expected[name].shape != given[name].shape:
-            faults.append(f"{name} is {list(given[name].shape)}, not {list(expected[name].shape)}")
-        elif given[name].dtype != torch.float32:
-            faults.append(f"{name} is {given[name].dtype}, not float32")
-    if faults:
-        raise ValueError("; ".join(sorted(faults)[:5]) + (" …" if len(faults) > 5 else ""))
+        super().__init__(info, lambda: CvaeNetworks(config), tensors)

@@ -65,7 +65,20 @@ def aligned_covariance(spread: Spread, time: Tensor, direction: Tensor) -> Tenso
     Returns:
         [N, T, 2, 2], m², symmetric and positive definite.
     """
-    along, across = spread.along.variance(time), spread.across.variance(time)
+    return oriented_covariance(spread.along.variance(time), spread.across.variance(time), direction)
+
+
+def oriented_covariance(along: Tensor, across: Tensor, direction: Tensor) -> Tensor:
+    """Covariances of what is independent along and across a direction.
+
+    Args:
+        along: [T], m², variance along it.
+        across: [T], m², across it.
+        direction: [N, T], rad.
+
+    Returns:
+        [N, T, 2, 2], m², symmetric.
+    """
     cos, sin = torch.cos(direction), torch.sin(direction)
     xx = along * cos.square() + across * sin.square()
     yy = along * sin.square() + across * cos.square()

@@ -1,9 +1,9 @@
 """What shape of network a checkpoint holds."""
 
 from enum import StrEnum
-from typing import Literal
+from typing import Annotated, Any, Literal, TypeAlias
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
 from model.scene import AgentType
 from model.standardization import STATE_SIZE
@@ -26,7 +26,7 @@ class BlindContext(StrEnum):
 
 
 class NetworkConfig(BaseModel):
-    """One network for each agent type; they share no parameters."""
+    """A CVAE for each agent type; they share no parameters."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -56,3 +56,62 @@ class NetworkConfig(BaseModel):
         """Length of the context encoding x."""
         parts = 1 + bool(self.neighbor_types) + self.looks_at_map(agent_type)
         return HIDDEN * parts
+
+    @property
+    def supports_blind(self) -> bool:
+        """Whether it can forecast from an agent's own history alone."""
+        return self.blind is not BlindContext.NONE
+
+
+class CoverNetConfig(BaseModel):
+    """A classifier over a fixed set of trajectories (Phan-Minh et al. 2020), for vehicles."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Literal["covernet"] = "covernet"
+    agent_types: tuple[Literal[AgentType.VEHICLE]] = (AgentType.VEHICLE,)
+    neighbor_types: tuple[AgentType, ...] = (AgentType.VEHICLE, AgentType.PEDESTRIAN)
+    """Types that are drawn around the agent; empty: none."""
+    uses_map: bool = True
+    epsilon: float = Field(default=2.0, gt=0)
+    """ε, m: how near each training trajectory has a member of the set, at every step."""
+    steps: int = Field(default=12, ge=1, le=120)
+    """T of the members, steps of 0.5 s."""
+    members: int = Field(default=0, ge=0, le=100_000)
+    """M, of the set; 0: not known yet, it is made when training begins."""
+    modes: int = Field(default=25, ge=1, le=255)
+    """The likeliest members, which a forecast consists of."""
+
+    @model_validator(mode="after")
+    def _makes_sense(self) -> "CoverNetConfig":
+        if not (self.uses_map or self.neighbor_types):
+            raise ValueError("there is nothing in the picture: neither map nor neighbours")
+        if 0 < self.members < self.modes:
+            raise ValueError(f"{self.modes} modes cannot be of {self.members} members")
+        for kind in self.neighbor_types:
+            if kind not in STATE_SIZE:
+                raise ValueError(f"agents of type {kind.value} are not drawn")
+        return self
+
+    def looks_at_map(self, agent_type: AgentType) -> bool:
+        """Whether forecasts of agents of that type depend on the map."""
+        return self.uses_map and agent_type in self.agent_types
+
+    @property
+    def supports_blind(self) -> bool:
+        """Whether it can forecast from an agent's own history alone."""
+        return False
+
+
+def _kind(value: Any) -> str:
+    kind = value.get("kind", "cvae") if isinstance(value, dict) else getattr(value, "kind", "")
+    return kind if isinstance(kind, str) else ""
+
+
+AnyNetworkConfig: TypeAlias = Annotated[
+    Annotated[NetworkConfig, Tag("cvae")] | Annotated[CoverNetConfig, Tag("covernet")],
+    Discriminator(
+        _kind, custom_error_type="network_kind", custom_error_message="kind must be cvae or covernet"
+    ),
+]
+"""Of any network; ``kind`` tells them apart, and is a CVAE's where it is not given."""

@@ -1,5 +1,7 @@
 """The decoder: one mode a latent category, a control Gaussian a step."""
 
+from collections.abc import Sequence
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -24,6 +26,8 @@ class ModeDecoder(nn.Module):
         self.mean = nn.Linear(DECODER_HIDDEN, 2)
         self.log_sigma = nn.Linear(DECODER_HIDDEN, 2)
         self.correlation = nn.Linear(DECODER_HIDDEN, 1)
+        self.training_dtype = torch.float32
+        """Of the unrolled cell in training; the heads, and all that follows them, are in float32."""
 
     def forward(
         self, encoding: Tensor, state_now: Tensor, steps: int, sample_controls: bool = False
@@ -39,36 +43,84 @@ class ModeDecoder(nn.Module):
         Returns:
             [N, K, T] each.
         """
-        agents, modes, split = len(encoding), self.modes, 2 * DECODER_HIDDEN
-        bias = self.cell.bias_ih.clone()
-        bias[:split] += self.cell.bias_hh[:split]
-        w_z, w_x, w_a = self.cell.weight_ih.split([modes, encoding.shape[1], 2], dim=1)
-        constant = self._outer(w_z, F.linear(encoding, w_x, bias))
-        gates, new = constant[:, :split].contiguous(), constant[:, split:].contiguous()
-        w_gates, w_new = w_a[:split].T, w_a[split:].T
+        agents, modes = len(encoding), self.modes
+        w_z, of_x, w_a = self._input_weights(encoding)
         h_z, h_x = self.initial_h.weight.split([modes, encoding.shape[1]], dim=1)
-        hidden = self._outer(h_z, F.linear(encoding, h_x, self.initial_h.bias))
+        hidden = _outer(h_z, F.linear(encoding, h_x, self.initial_h.bias))
         action = self.initial_action(state_now).repeat_interleave(modes, dim=0)
-        weight = torch.cat([self.mean.weight, self.log_sigma.weight, self.correlation.weight])
-        head_bias = torch.cat([self.mean.bias, self.log_sigma.bias, self.correlation.bias])
-
-        outputs = []
-        for _ in range(steps):
-            hidden = self.cell(torch.addmm(gates, action, w_gates), torch.addmm(new, action, w_new), hidden)
-            outputs.append(F.linear(hidden, weight, head_bias))
-            action = _sample(outputs[-1]) if sample_controls else outputs[-1][:, :2]
+        outputs = self._unroll([_outer(w_z, of_x)] * steps, w_a, hidden, action, sample_controls)[0]
         # [5, N, K, T], contiguous: all that follows works on whole tensors of one quantity
         stacked = torch.stack(outputs).permute(2, 1, 0).contiguous().unflatten(1, (agents, modes))
         sigma = stacked[2:4].exp()
         covariance = torch.tanh(stacked[4]) * sigma[0] * sigma[1]
         return Controls(stacked[0], stacked[1], sigma[0].square(), covariance, sigma[1].square())
 
-    def _outer(self, by_mode: Tensor, by_agent: Tensor) -> Tensor:
-        """Every mode's column (z is one-hot: a look-up, no product) with every agent's row.
+    def sample(self, encoding: Tensor, state_now: Tensor, latents: Tensor) -> Tensor:
+        """Draws of the controls of one category an agent and step, each fed back; differentiable.
 
-        [H, K], [N, H] → [N·K, H].
+        Args:
+            encoding: [N, X].
+            state_now: [N, D], standardised.
+            latents: [N, T] int64; one that changes on the way is a hallucination
+                (HalentNet, Zhu et al. 2021).
+
+        Returns:
+            [N, T, 2].
         """
-        return (by_agent[:, None, :] + by_mode.T[None, :, :]).flatten(0, 1)
+        w_z, of_x, w_a = self._input_weights(encoding)
+        h_z, h_x = self.initial_h.weight.split([self.modes, encoding.shape[1]], dim=1)
+        hidden = F.linear(encoding, h_x, self.initial_h.bias) + h_z.T[latents[:, 0]]
+        inputs = [of_x + w_z.T[step] for step in latents.unbind(dim=1)]
+        return torch.stack(self._unroll(inputs, w_a, hidden, self.initial_action(state_now), True)[1], dim=1)
+
+    def _input_weights(self, encoding: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The cell's weights of z [3H, K], what x adds to its gates [N, 3H], and its weights of a [3H, 2]."""
+        split = 2 * DECODER_HIDDEN
+        bias = self.cell.bias_ih.clone()
+        bias[:split] += self.cell.bias_hh[:split]
+        w_z, w_x, w_a = self.cell.weight_ih.split([self.modes, encoding.shape[1], 2], dim=1)
+        return w_z, F.linear(encoding, w_x, bias), w_a
+
+    def _unroll(
+        self, inputs: Sequence[Tensor], w_a: Tensor, hidden: Tensor, action: Tensor, sample_controls: bool
+    ) -> tuple[list[Tensor], list[Tensor]]:
+        """The heads' outputs [R, 5] and the controls fed back [R, 2] of each step, for R rows.
+
+        Args:
+            inputs: [R, 3H] a step, what z and x add to the gates.
+            w_a: [3H, 2].
+            hidden: [R, H].
+            action: [R, 2], the control before the first step.
+            sample_controls: feed back samples instead of means.
+        """
+        split = 2 * DECODER_HIDDEN
+        low = self.training and self.training_dtype is not torch.float32
+        dtype = self.training_dtype if low else hidden.dtype
+        w_gates, w_new = w_a[:split].T.to(dtype), w_a[split:].T.to(dtype)
+        weight = torch.cat([self.mean.weight, self.log_sigma.weight, self.correlation.weight])
+        head_bias = torch.cat([self.mean.bias, self.log_sigma.bias, self.correlation.bias])
+        hidden = hidden.to(dtype)
+        outputs: list[Tensor] = []
+        actions: list[Tensor] = []
+        constant: Tensor | None = None
+        for given in inputs:
+            if given is not constant:  # the same one at every step but in a hallucination
+                gates, new = (part.to(dtype).contiguous() for part in (given[:, :split], given[:, split:]))
+                constant = given
+            fed = action.to(dtype)
+            hidden = self.cell(torch.addmm(gates, fed, w_gates), torch.addmm(new, fed, w_new), hidden)
+            outputs.append(F.linear(hidden.to(weight.dtype), weight, head_bias))
+            action = _sample(outputs[-1]) if sample_controls else outputs[-1][:, :2]
+            actions.append(action)
+        return outputs, actions
+
+
+def _outer(by_mode: Tensor, by_agent: Tensor) -> Tensor:
+    """Every mode's column (z is one-hot: a look-up, no product) with every agent's row.
+
+    [H, K], [N, H] → [N·K, H].
+    """
+    return (by_agent[:, None, :] + by_mode.T[None, :, :]).flatten(0, 1)
 
 
 def _sample(outputs: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """What becomes of history, neighbours, map and (in training) the future."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import TypeAlias
 
 import torch
 import torch.nn.functional as F
@@ -12,6 +13,10 @@ from model.scene import AgentType
 
 RNN_DROPOUT = 0.25
 MAP_DROPOUT = 0.5
+
+ConvShape: TypeAlias = tuple[int, int, int, int]
+"""Channels in, channels out, kernel, stride."""
+MAP_LAYERS: tuple[ConvShape, ...] = ((3, 10, 5, 2), (10, 20, 5, 2), (20, 10, 5, 1), (10, 1, 3, 1))
 
 
 class HistoryEncoder(HistoryLSTM):
@@ -76,19 +81,30 @@ class NeighborEncoder(nn.Module):
 
 
 class MapEncoder(nn.Module):
-    """Four convolutions over the map patch: [N, 3, 100, 100] in [-1, 1] → [N, 32]."""
+    """Convolutions over the map patch: [N, 3, 100, 100] in [-1, 1] → [N, 32], unless told otherwise.
 
-    def __init__(self) -> None:
+    Args:
+        shapes: of each layer: channels in and out, kernel, stride.
+        pixels: that the last layer leaves, over all its channels.
+        size: of the encoding.
+    """
+
+    def __init__(
+        self, shapes: Sequence[ConvShape] = MAP_LAYERS, pixels: int = 256, size: int = HIDDEN
+    ) -> None:
         super().__init__()
-        shapes = ((3, 10, 5, 2), (10, 20, 5, 2), (20, 10, 5, 1), (10, 1, 3, 1))
         self.convs = nn.ModuleList(nn.Conv2d(i, o, k, stride=s) for i, o, k, s in shapes)
-        self.project = nn.Linear(256, HIDDEN)
+        self.project = nn.Linear(pixels, size)
         self.dropout = nn.Dropout(MAP_DROPOUT)
+        self.training_dtype = torch.float32
+        """Of the convolutions in training."""
 
     def forward(self, patches: Tensor) -> Tensor:
-        for conv in self.convs:
-            patches = F.leaky_relu(conv(patches), 0.2)
-        encoded: Tensor = self.dropout(self.project(patches.flatten(1)))
+        low = self.training and self.training_dtype is not torch.float32
+        with torch.autocast(patches.device.type, self.training_dtype, enabled=low):
+            for conv in self.convs:
+                patches = F.leaky_relu(conv(patches), 0.2)
+        encoded: Tensor = self.dropout(self.project(patches.flatten(1).to(self.project.weight.dtype)))
         return encoded
 
     def null(self, agents: int) -> Tensor:

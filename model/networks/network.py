@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from model.forecaster import Context, Features
 from model.networks.config import HIDDEN, BlindContext, NetworkConfig
 from model.networks.decoder import ModeDecoder
-from model.networks.dynamics import Positions, integrate_unicycle, integrate_velocity
+from model.networks.dynamics import Controls, Positions, integrate_unicycle, integrate_velocity
 from model.networks.encoders import FutureEncoder, HistoryEncoder, MapEncoder, NeighborEncoder
 from model.scene import AgentType
 from model.standardization import STATE_SIZE
@@ -124,12 +124,35 @@ class AgentNetwork(nn.Module):
         """
         branch = self.branch(context)
         controls = branch.decoder(encoding, features["history"][:, -1], steps, sample_controls)
+        return self._integrate(branch, controls, encoding, features)
+
+    def sample(self, encoding: Tensor, features: Features, latents: Tensor) -> Tensor:
+        """One trajectory an agent of the full context, its controls drawn; differentiable.
+
+        Args:
+            encoding: [N, X], of the full context.
+            features: of the agents.
+            latents: [N, T] int64, the category at each step.
+
+        Returns:
+            [N, T, 2], m, relative to now.
+        """
+        controls = self.full.decoder.sample(encoding, features["history"][:, -1], latents)
+        one, another = controls[:, None].unbind(dim=-1)  # one "mode" an agent
+        none = torch.zeros_like(one)
+        drawn = Controls(one, another, none, none, none)
+        return self._integrate(self.full, drawn, encoding, features).mean[:, 0]
+
+    def _integrate(
+        self, branch: Branch, controls: Controls, encoding: Tensor, features: Features
+    ) -> Positions:
+        """Positions out of controls [N, M, T]."""
         if branch.heading_correction is None:
             return integrate_velocity(controls)
         velocity = features["velocity"]
         heading = torch.atan2(velocity[:, 1], velocity[:, 0])[:, None]
         heading = heading + torch.tanh(branch.heading_correction(torch.cat([encoding, heading], dim=1)))
-        modes = (len(encoding), self.config.modes)
+        modes = controls.mean_0.shape[:2]
         speed = velocity.norm(dim=1, keepdim=True)
         return integrate_unicycle(controls, heading.expand(modes), speed.expand(modes))
 

@@ -79,11 +79,12 @@ class GRUCell(nn.Module):
             reset_update_in: [N, 2·hidden_size], what the input adds to these gates, both biases included;
                 overwritten.
             new_in: [N, hidden_size], what the input adds to the candidate, its bias included.
-            hidden: [N, hidden_size].
+            hidden: [N, hidden_size]; all three of one dtype, which the weights are brought to.
         """
         size = self.hidden_size
-        gates = reset_update_in.addmm_(hidden, self.weight_hh[: 2 * size].T).sigmoid_()
-        candidate = F.linear(hidden, self.weight_hh[2 * size :], self.bias_hh[2 * size :])
+        weight, bias = self.weight_hh.to(hidden.dtype), self.bias_hh.to(hidden.dtype)
+        gates = reset_update_in.addmm_(hidden, weight[: 2 * size].T).sigmoid_()
+        candidate = F.linear(hidden, weight[2 * size :], bias[2 * size :])
         # tanh(x) = 2σ(2x) − 1: on CPUs the sigmoid takes a third of tanh's time
         new = torch.sigmoid(2 * torch.addcmul(new_in, gates[:, :size], candidate)) * 2 - 1
         return torch.lerp(new, hidden, gates[:, size:])

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from model.cvae import CvaeNetworks
 from model.forecaster import ModelInfo, Protocol
-from model.networks.config import BlindContext, NetworkConfig
+from model.networks.config import AnyNetworkConfig, NetworkConfig
 
 
 def network() -> NetworkConfig:
@@ -14,7 +14,7 @@ def network() -> NetworkConfig:
 
 
 def info(
-    config: NetworkConfig | None = None,
+    config: AnyNetworkConfig | None = None,
     name: str = "some-model",
     version: str = "1.0.0",
     protocol: Protocol = Protocol.CAUSAL,
@@ -32,7 +32,7 @@ def info(
         modes=config.modes,
         uses_map=config.uses_map,
         uses_neighbors=bool(config.neighbor_types),
-        supports_blind=config.blind is not BlindContext.NONE,
+        supports_blind=config.supports_blind,
         license="none",
     )
 

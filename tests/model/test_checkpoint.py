@@ -117,8 +117,8 @@ def test_an_unknown_format_version_is_said_before_all_else(folder: Path) -> None
         (lambda c: c["info"].pop("name"), "info.name: Field required"),
         (lambda c: c["info"].update(protocol="psychic"), "info.protocol"),
         (lambda c: c["info"].update(version="newest"), "not a version (PEP 440)"),
-        (lambda c: c["network"].update(kind="oracle"), "network.kind"),
-        (lambda c: c["network"].update(modes=-1), "network.modes"),
+        (lambda c: c["network"].update(kind="oracle"), "network: kind must be cvae or covernet"),
+        (lambda c: c["network"].update(modes=-1), "network.cvae.modes"),
     ],
 )
 def test_faults_in_the_config_are_named(

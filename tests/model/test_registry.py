@@ -93,6 +93,35 @@ def test_models_of_the_paper_protocol_must_be_asked_for(tmp_path: Path) -> None:
     assert "trajectron" in Registry.load(tmp_path, allow_paper=True)
 
 
+def test_beside_others_they_are_passed_over_and_said_to_be(tmp_path: Path) -> None:
+    _save(tmp_path / "cab", "cab", "1.0.0")
+    _save(tmp_path / "cab-paper", "cab", "1.0.0+paper", Protocol.PAPER)
+    registry = Registry.load(tmp_path)
+    assert [model.name for model in registry.infos()] == ["cab", *BASELINES]
+    assert [model.version for model in registry.passed_over] == ["1.0.0+paper"]
+    with pytest.raises(UnknownModelError, match=r"not allowed, so cab@1\.0\.0\+paper was not loaded"):
+        registry.get("cab@1.0.0+paper")
+    with pytest.raises(UnknownModelError, match=r"kalman@1\.0\.0$"):
+        registry.get("nobody")
+    assert not Registry.load(tmp_path, allow_paper=True).passed_over
+
+
+def test_a_name_alone_is_the_causal_model(tmp_path: Path) -> None:
+    for version, protocol in (
+        ("1.0.0", Protocol.CAUSAL),
+        ("1.0.0+paper", Protocol.PAPER),
+        ("2.0.0+paper", Protocol.PAPER),
+    ):
+        _save(tmp_path / version, "cab", version, protocol)
+    _save(tmp_path / "old", "trajectron", "1.0.0+paper", Protocol.PAPER)
+    _save(tmp_path / "new", "trajectron", "1.1.0+paper", Protocol.PAPER)
+    registry = Registry.load(tmp_path, allow_paper=True)
+    found = {name: registry.get(name).info for name in ("cab", "cab@1.0.0+paper", "cab@2.0.0+paper")}
+    assert [info.version for info in found.values()] == ["1.0.0", "1.0.0+paper", "2.0.0+paper"]
+    assert [info.protocol.value for info in found.values()] == ["causal", "paper", "paper"]
+    assert registry.get("trajectron").info.version == "1.1.0+paper"
+
+
 def test_a_damaged_checkpoint_is_not_passed_over(tmp_path: Path) -> None:
     _save(tmp_path / "one", "cab", "1.0.0")
     (tmp_path / "one" / "model.safetensors").write_bytes(b"")

@@ -1,0 +1,28 @@
+"""What the network of a configuration takes of a scene."""
+
+import torch
+
+from model.arrays import Ints
+from model.features import scene_features
+from model.forecaster import Context, Features
+from model.networks.config import AnyNetworkConfig, NetworkConfig
+from model.scene import AgentType, Scene
+from model.surroundings import surroundings
+
+
+def network_features(
+    scene: Scene, targets: Ints, agent_type: AgentType, config: AnyNetworkConfig, context: Context
+) -> Features:
+    """Features of n agents of one type.
+
+    Returns:
+        ``model.features.scene_features``; for CoverNet without neighbours' histories, but with
+        ``surroundings`` [n, S, 5] float32 (``model.surroundings``), if it draws any and with full context.
+    """
+    if isinstance(config, NetworkConfig):
+        return scene_features(scene, targets, agent_type, config, context)
+    alone = NetworkConfig(neighbor_types=(), uses_map=config.uses_map)
+    features = scene_features(scene, targets, agent_type, alone, context)
+    if config.neighbor_types and context is Context.FULL:
+        features["surroundings"] = torch.from_numpy(surroundings(scene, targets, config.neighbor_types))
+    return features

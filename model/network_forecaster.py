@@ -1,0 +1,123 @@
+"""What forecasters around trained networks share."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from model.arrays import Ints
+from model.forecaster import Context, Features, Forecaster, ModelInfo
+from model.inputs import network_features
+from model.mixture import TrajectoryMixture
+from model.networks.config import AnyNetworkConfig
+from model.scene import AgentType, Scene
+from model.single import require_observed
+
+SMALLEST_VARIANCE = 1e-6
+"""m²; no forecast is surer than that in any direction."""
+
+Network = TypeVar("Network", bound=nn.Module)
+
+
+class Networks(nn.ModuleDict, Generic[Network]):
+    """One network an agent type, by its name: the parameters of a checkpoint.
+
+    Each takes features, a context and the steps T, and gives log-probabilities of its modes [N, K] and
+    their ``Positions``, relative to now.
+
+    Args:
+        config: their shape.
+        networks: by type.
+    """
+
+    def __init__(self, config: AnyNetworkConfig, networks: Mapping[AgentType, Network]) -> None:
+        super().__init__({kind.value: network for kind, network in networks.items()})
+        self.config = config
+
+    def of(self, agent_type: AgentType) -> Network:
+        """The network of that type."""
+        network: Any = self[agent_type.value]
+        made: Network = network
+        return made
+
+
+SomeNetworks = TypeVar("SomeNetworks", bound=Networks[Any])
+
+
+class NetworkForecaster(Forecaster, Generic[SomeNetworks]):
+    """A forecaster around networks and their trained parameters.
+
+    Args:
+        info: what is known of the model.
+        make: makes the networks.
+        tensors: their parameters by name.
+
+    Raises:
+        ValueError: the tensors are not those of such networks, naming them.
+    """
+
+    def __init__(
+        self, info: ModelInfo, make: Callable[[], SomeNetworks], tensors: Mapping[str, Tensor]
+    ) -> None:
+        self.info = info
+        with torch.device("meta"):  # nothing is drawn that the tensors replace
+            self.networks = make()
+        self.config = self.networks.config
+        _check(dict(self.networks.state_dict()), tensors)
+        self.networks.load_state_dict(dict(tensors), assign=True)
+        self.networks.eval().requires_grad_(False)
+
+    def requires_heading(self, agent_type: AgentType) -> bool:
+        """Vehicles only: a pedestrian's state has no heading, and it sees no map."""
+        return agent_type is AgentType.VEHICLE
+
+    def looks_at_map(self, agent_type: AgentType) -> bool:
+        """Vehicles only, if at all."""
+        return self.config.looks_at_map(agent_type)
+
+    def prepare(self, scene: Scene, targets: Ints, context: Context = Context.FULL) -> Features:
+        agent_type = scene.types[int(targets[0])]
+        states = scene.states.last_frames(self.info.history_frames)
+        require_observed(states, targets)
+        if self.requires_heading(agent_type) and np.isnan(states.heading[targets, -1]).any():
+            raise ValueError("an agent to be forecast has no heading")
+        scene = Scene(scene.types, states, scene.raster, scene.patches)
+        return network_features(scene, targets, agent_type, self.config, context)
+
+    @torch.inference_mode()
+    def forecast(
+        self,
+        features: Features,
+        agent_type: AgentType,
+        context: Context = Context.FULL,
+        steps: int | None = None,
+    ) -> TrajectoryMixture:
+        network = self.networks.of(agent_type)
+        log_weights, positions = network(features, context, steps or self.info.steps)
+        return TrajectoryMixture(
+            log_weights, positions.mean, _positive(positions.covariance), features["origin"]
+        )
+
+
+def _positive(covariances: Tensor) -> Tensor:
+    """Strictly positive definite covariances: what is told from one control alone has no width across.
+
+    Adds a variance of (1 mm)² and a millionth of the trace, which is above float32's rounding.
+    """
+    trace = covariances.diagonal(dim1=-2, dim2=-1).sum(-1)
+    width = SMALLEST_VARIANCE + 1e-6 * trace
+    return covariances + width[..., None, None] * torch.eye(2, dtype=covariances.dtype)
+
+
+def _check(expected: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> None:
+    faults = [f"{name} is missing" for name in expected if name not in given]
+    faults += [f"{name} is not of this network" for name in given if name not in expected]
+    for name in expected.keys() & given.keys():
+        if expected[name].shape != given[name].shape:
+            faults.append(f"{name} is {list(given[name].shape)}, not {list(expected[name].shape)}")
+        elif given[name].dtype != torch.float32:
+            faults.append(f"{name} is {given[name].dtype}, not float32")
+    if faults:
+        raise ValueError("; ".join(sorted(faults)[:5]) + (" …" if len(faults) > 5 else ""))

@@ -1,0 +1,114 @@
+"""CoverNet: forecasting as classification over a fixed set of trajectories."""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from model.forecaster import Context, Features
+from model.networks.config import CoverNetConfig
+from model.networks.drawing import draw_boxes
+from model.networks.dynamics import Positions
+from model.networks.encoders import ConvShape, MapEncoder
+from model.scene import AgentType
+from model.standardization import HEADING, state_scale
+from model.uncertainty import oriented_covariance
+
+_MAP_CHANNELS = 3
+_PIXELS = 64 * 4 * 4
+_ENCODING = 64
+_OWN = 64
+_HIDDEN = 96
+_VELOCITY, _ACCELERATION, _RATE = slice(2, 4), slice(4, 6), 7
+
+
+class CoverNet(nn.Module):
+    """The fixed-set classifier of Phan-Minh et al. 2020 (section 3), with a small backbone.
+
+    It sees a picture of the scene in the agent's frame, which is the map patch and a layer with the other
+    agents as boxes at their places now, and the agent's speed, acceleration along its heading and heading
+    rate. Vehicles and pedestrians share the layer and differ by their size, so that a network that was
+    trained on data without pedestrians takes one for something small, not for nothing or anything.
+
+    Its logits are over all M members of the set; a forecast is the likeliest K of them, laid where the agent
+    is, with the spread that the training trajectories have about their nearest members.
+
+    Args:
+        config: its shape, ``members`` known.
+
+    Raises:
+        ValueError: ``members`` is not known.
+    """
+
+    cover: Tensor
+    """[M, T, 2], m, x ahead and y to the left of the agent now."""
+    variance: Tensor
+    """[T, 2], m², of the truth about its member, ahead and to the left."""
+
+    def __init__(self, config: CoverNetConfig) -> None:
+        super().__init__()
+        if not config.members:
+            raise ValueError("the network's set of trajectories is not known: members is 0")
+        self.config = config
+        channels = _MAP_CHANNELS * config.uses_map + bool(config.neighbor_types)
+        layers: tuple[ConvShape, ...] = ((channels, 16, 5, 2), (16, 32, 5, 2), (32, 48, 3, 2), (48, 64, 3, 2))
+        self.picture = MapEncoder(layers, _PIXELS, _ENCODING)
+        self.own = nn.Linear(3, _OWN)
+        self.hidden = nn.Linear(_ENCODING + _OWN, _HIDDEN)
+        self.logits = nn.Linear(_HIDDEN, config.members)
+        self.register_buffer("cover", torch.zeros(config.members, config.steps, 2))
+        self.register_buffer("variance", torch.ones(config.steps, 2))
+
+    def scores(self, features: Features) -> Tensor:
+        """Logits of all members: [N, M]."""
+        layers = [features["map"]] if self.config.uses_map else []
+        if self.config.neighbor_types:
+            layers.append(draw_boxes(features["surroundings"])[:, None])
+        picture = self.picture(torch.cat(layers, dim=1))
+        own = F.relu(self.own(_kinematics(features)))
+        hidden = F.relu(self.hidden(torch.cat([picture, own], dim=1)))
+        logits: Tensor = self.logits(hidden)
+        return logits
+
+    def forward(self, features: Features, context: Context, steps: int) -> tuple[Tensor, Positions]:
+        """Log-probabilities of the K likeliest members among themselves [N, K], and their positions.
+
+        Raises:
+            ValueError: the context is blind, or there are more steps than the members have.
+        """
+        if context is not Context.FULL:
+            raise ValueError("this network has no blind forecast")
+        if steps > self.config.steps:
+            raise ValueError(f"this network's trajectories have {self.config.steps} steps, not {steps}")
+        logits, likeliest = self.scores(features).topk(self.config.modes, dim=1)
+        heading = present_heading(features)
+        mean = turned(self.cover[likeliest, :steps], heading)
+        along, across = self.variance[:steps].unbind(dim=1)
+        covariance = oriented_covariance(along, across, heading[:, None].expand(-1, steps))
+        shared = covariance[:, None].expand(-1, self.config.modes, -1, -1, -1)
+        return F.log_softmax(logits, dim=1), Positions(mean, shared)
+
+
+def present_heading(features: Features) -> Tensor:
+    """Of vehicles, now: [N] rad."""
+    heading: Tensor = features["history"][:, -1, HEADING] * _SCALE[HEADING]
+    return heading
+
+
+def turned(vectors: Tensor, angle: Tensor) -> Tensor:
+    """Vectors [N, …, 2] turned counter-clockwise by angles [N], rad."""
+    shape = (-1, *[1] * (vectors.dim() - 2))
+    cos, sin = torch.cos(angle).view(shape), torch.sin(angle).view(shape)
+    x, y = vectors.unbind(dim=-1)
+    return torch.stack([cos * x - sin * y, sin * x + cos * y], dim=-1)
+
+
+def _kinematics(features: Features) -> Tensor:
+    """[N, 3]: speed, acceleration along the heading, heading rate, standardised."""
+    now = features["history"][:, -1]
+    heading = present_heading(features)
+    ahead = torch.stack([torch.cos(heading), torch.sin(heading)], dim=1)
+    speed = now[:, _VELOCITY].norm(dim=1)
+    return torch.stack([speed, (now[:, _ACCELERATION] * ahead).sum(dim=1), now[:, _RATE]], dim=1)
+
+
+_SCALE = state_scale(AgentType.VEHICLE, AgentType.VEHICLE).tolist()
