@@ -34,10 +34,10 @@ from model.data.checks import FUTURE_STEPS, check_pairs, check_raster
 from model.data.packing import pack, unpack
 from model.data.protocols import SceneFrames
 from model.data.scenes import DataError, Reader, SceneRecord
-from model.features import scene_features
 from model.forecaster import Context, Protocol
 from model.geometry import wrap_angle
-from model.networks.config import NetworkConfig
+from model.inputs import network_features
+from model.networks.config import AnyNetworkConfig
 from model.scene import AgentType, Raster
 
 __all__ = ["Cache", "CacheKey", "build_cache"]
@@ -60,7 +60,7 @@ class Cache:
     neighbors: dict[AgentType, Float32s]
     """[P, F, D] per type, summed standardised histories of neighbours."""
     edge_mask: Float32s
-    """[P]; zeros where no neighbours are looked at."""
+    """[P]; zeros where no neighbours' histories are looked at."""
     future: Float32s
     """[P, 12, 2], m, relative to the position now, ground frame."""
     position: Floats
@@ -88,6 +88,8 @@ class Cache:
     """[S, 2], m."""
     raster_pixels_per_meter: Floats
     """[S]."""
+    surroundings: Float32s | None = None
+    """[P, B, 5], neighbours as boxes (``model.surroundings``); None: not held."""
 
     def __len__(self) -> int:
         """P."""
@@ -123,7 +125,7 @@ class Cache:
         if key is not None:
             _check_key(folder, manifest.key, key)
         arrays = _open_arrays(folder, manifest.pairs, pair_layout(manifest.key))
-        kinds = manifest.key.neighbor_types
+        kinds = manifest.key.summed_types
         neighbors = {kind: arrays.pop(neighbors_name(kind)) for kind in kinds}
         arrays |= _open_arrays(folder, len(manifest.scenes), SCENE_LAYOUT)
         rasters = _open_rasters(folder / RASTERS_FILE, manifest.raster_bytes)
@@ -134,7 +136,7 @@ def build_cache(
     reader: Reader,
     split: str,
     protocol: Protocol,
-    config: NetworkConfig,
+    config: AnyNetworkConfig,
     history_frames: int,
     folder: Path,
     progress: Callable[[SceneRecord], None] | None = None,
@@ -145,7 +147,7 @@ def build_cache(
         reader: gives the scenes.
         split: one of the reader's.
         protocol: of the inputs.
-        config: says which neighbours are looked at.
+        config: says which neighbours are looked at, and how.
         history_frames: F, frames of history, now included.
         folder: where to; made, with its parents, where it does not exist.
         progress: called after each scene.
@@ -179,7 +181,7 @@ def build_cache(
         _save(new, scenes, SCENE_LAYOUT)
         manifest = Manifest(
             format_version=FORMAT_VERSION,
-            derivation=derivation(),
+            derivation=derivation(key),
             key=key,
             pairs=sum(len(part["frame"]) for part in pairs),
             scenes=tuple(names),
@@ -189,7 +191,7 @@ def build_cache(
 
 
 def _pair_arrays(
-    record: SceneRecord, scene: int, protocol: Protocol, config: NetworkConfig, history_frames: int
+    record: SceneRecord, scene: int, protocol: Protocol, config: AnyNetworkConfig, history_frames: int
 ) -> Arrays:
     scenes = SceneFrames(record, protocol, history_frames)
     frame = np.array([pair.frame for pair in record.pairs], dtype=np.int64)
@@ -198,7 +200,7 @@ def _pair_arrays(
     for now in np.unique(frame):  # the pairs are in this order
         seen, tracks = scenes.at(int(now))
         targets = np.searchsorted(tracks, track[frame == now])
-        features = scene_features(seen, targets, AgentType.VEHICLE, config, Context.FULL)
+        features = network_features(seen, targets, AgentType.VEHICLE, config, Context.FULL)
         part: Arrays = {name: tensor.numpy() for name, tensor in features.items()}
         part["position"] = part.pop("origin")
         part["heading"] = seen.states.heading[targets, -1]
@@ -278,7 +280,7 @@ def _read_manifest(file: Path) -> Manifest:
     except ValidationError as error:
         faults = (f"{'.'.join(map(str, fault['loc']))}: {fault['msg']}" for fault in error.errors())
         raise DataError(f"{file}: {'; '.join(faults)}") from error
-    if manifest.derivation != derivation():
+    if manifest.derivation != derivation(manifest.key):
         raise DataError(f"{file}: made by other code than this (derivation differs); build the cache anew")
     return manifest
 

@@ -7,14 +7,15 @@ from typing import TypeAlias
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from model import features, geometry, neighbors, resample, standardization
+from model import features, geometry, inputs, neighbors, raster, resample, standardization, surroundings
 from model.data import packing, protocols
 from model.data.checks import FUTURE_STEPS
 from model.data.scenes import Reader
 from model.forecaster import Protocol
-from model.networks.config import NetworkConfig
+from model.networks.config import AnyNetworkConfig, CoverNetConfig
 from model.scene import AgentType
 from model.standardization import STATE_SIZE
+from model.surroundings import BOX_NUMBERS, BOXES
 
 FORMAT_VERSION = 1
 """Of the folder's layout; what reads one version reads no other."""
@@ -22,6 +23,7 @@ MANIFEST_FILE = "manifest.json"
 RASTERS_FILE = "rasters.u8"
 
 _DERIVED_BY = (resample, features, neighbors, standardization, geometry, protocols, packing)
+_DRAWN_BY = (inputs, surroundings, raster)
 
 Layout: TypeAlias = dict[str, tuple[type[np.generic], tuple[int, ...]]]
 """Type and shape, without the first axis, of arrays by name."""
@@ -42,24 +44,35 @@ class CacheKey(BaseModel):
 
     reader: str
     """Class of the reader."""
+    data: str = ""
+    """Where it reads: two data sets never share a cache by mistake."""
     split: str
     protocol: Protocol
     history_frames: int = Field(ge=1)
     neighbor_types: tuple[AgentType, ...]
-    """Of the network's configuration; nothing else of it changes the arrays, so methods share caches."""
+    """Of the network's configuration; little else of it changes the arrays, so methods share caches."""
+    drawn: bool = False
+    """Whether neighbours are held as boxes to be drawn (CoverNet) instead of as summed histories."""
 
     @classmethod
     def of(
-        cls, reader: Reader, split: str, protocol: Protocol, config: NetworkConfig, history_frames: int
+        cls, reader: Reader, split: str, protocol: Protocol, config: AnyNetworkConfig, history_frames: int
     ) -> "CacheKey":
         """The key of the cache that ``build_cache`` makes of the same arguments."""
         return cls(
             reader=type(reader).__name__,
+            data=reader.place,
             split=split,
             protocol=protocol,
             history_frames=history_frames,
             neighbor_types=config.neighbor_types,
+            drawn=draws(config),
         )
+
+    @property
+    def summed_types(self) -> tuple[AgentType, ...]:
+        """Types whose summed histories are held."""
+        return () if self.drawn else self.neighbor_types
 
 
 class Manifest(BaseModel):
@@ -94,9 +107,16 @@ def pair_layout(key: CacheKey) -> Layout:
         "frame": (np.int64, ()),
         "token": (np.bytes_, ()),
     }
-    for kind in key.neighbor_types:
+    for kind in key.summed_types:
         layout[neighbors_name(kind)] = (np.float32, (frames, STATE_SIZE[kind]))
+    if key.drawn:
+        layout["surroundings"] = (np.float32, (BOXES, BOX_NUMBERS))
     return layout
+
+
+def draws(config: AnyNetworkConfig) -> bool:
+    """Whether the network looks at its neighbours as boxes in a picture."""
+    return isinstance(config, CoverNetConfig) and bool(config.neighbor_types)
 
 
 def neighbors_name(kind: AgentType) -> str:
@@ -104,9 +124,9 @@ def neighbors_name(kind: AgentType) -> str:
     return f"neighbors.{kind.value}"
 
 
-def derivation() -> str:
+def derivation(key: CacheKey) -> str:
     """Digest of the code that arrays come out of: a cache that other code has made is stale."""
     digest = hashlib.sha256()
-    for module in _DERIVED_BY:
+    for module in (*_DERIVED_BY, *(_DRAWN_BY if key.drawn else ())):
         digest.update(inspect.getsource(module).encode())
     return digest.hexdigest()

@@ -72,6 +72,11 @@ class NuscenesReader:
         self._maps: dict[str, VectorMap] = {}
 
     @property
+    def place(self) -> str:
+        """The dataroot, absolute."""
+        return str(self._dataroot.resolve())
+
+    @property
     def splits(self) -> tuple[str, ...]:
         """Splits of the prediction challenge; two of them on v1.0-mini."""
         return tuple(_VERSIONS)

@@ -39,6 +39,11 @@ class NuscenesPredReader:
         self._folder = folder
 
     @property
+    def place(self) -> str:
+        """The folder, absolute."""
+        return str(self._folder.resolve())
+
+    @property
     def splits(self) -> tuple[str, ...]:
         """Splits of the prediction challenge."""
         return tuple(_FOLDERS)

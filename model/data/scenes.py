@@ -54,6 +54,11 @@ class Reader(Interface):
     """Gives the scenes of a data set."""
 
     @property
+    def place(self) -> str:
+        """Where the data is: another place is other data."""
+        ...
+
+    @property
     def splits(self) -> tuple[str, ...]:
         """Names that ``scenes`` takes."""
         ...

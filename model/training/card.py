@@ -19,11 +19,17 @@ class Origin:
     validation: str
     """The split that the figures are of, in words."""
     command: str
+    """That makes it, without the paths of the machine that did."""
     machine: str
 
 
 def model_card(
-    config: TrainingConfig, origin: Origin, progress: Progress, version: str, figures: dict[str, float]
+    config: TrainingConfig,
+    origin: Origin,
+    progress: Progress,
+    version: str,
+    figures: dict[str, float],
+    width: float | None,
 ) -> str:
     """Markdown.
 
@@ -33,6 +39,7 @@ def model_card(
         progress: where the run stands; the checkpoint is its best epoch.
         version: of the checkpoint.
         figures: of the best epoch by name.
+        width: factor on the standard deviations that was fitted after training; None: none was.
     """
     inputs = {
         Protocol.CAUSAL: "causal: states from the past alone, as a live service has them",
@@ -48,10 +55,12 @@ def model_card(
 - **Protocol**: {inputs[origin.protocol]}.
 - **Forecasts** vehicles, 6 s ahead at 2 Hz, as {config.network.modes} modes; uses up to
   {config.history_frames} frames of history.
+- **Begun** with {config.start or "random parameters"}.
 - **Training**: best of {progress.epoch} epochs (epoch {progress.best_epoch}; settings ask for
   {config.epochs}), batches of {config.batch_size}, learning rate {config.learning_rate:g},
   seed {config.seed}; {progress.seconds / 60:.0f} minutes on {origin.machine}.
-- **Command**: `{origin.command}`
+- **Widths** of the forecasts: {_width(width)}.
+- **Command**: `{origin.command}`, with the settings below as SETTINGS.toml.
 - **Licence**: {LICENSE}.
 
 ## Figures
@@ -62,4 +71,19 @@ mode on this same split.
 | figure | value |
 |---|---|
 {rows}
+
+## Settings
+
+```toml
+{config.toml()}
+```
 """
+
+
+def _width(factor: float | None) -> str:
+    if factor is None:
+        return "as the method has them"
+    return (
+        f"standard deviations times {factor:.3f}, fitted after training, so that 90 % regions hold 90 % of "
+        "training positions; means and probabilities are the network's own"
+    )

@@ -1,14 +1,15 @@
 """How a method is trained: one TOML file each in ``methods/``."""
 
+import json
 import tomllib
 from enum import StrEnum
 from importlib import resources
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from model.networks.config import NetworkConfig
-from model.training.objectives import OBJECTIVES
+from model.networks.config import AnyNetworkConfig, CoverNetConfig
+from model.training.precision import Precision
 
 
 class TrainingError(Exception):
@@ -23,6 +24,9 @@ class Method(StrEnum):
     TRAJECTRON_NO_CONTEXT = "trajectron-no-context"
     REWEIGHT = "reweight"
     RUBIZ = "rubiz"
+    HALENTNET = "halentnet"
+    HALENTNET_NO_CONTEXT = "halentnet-no-context"
+    COVERNET = "covernet"
 
 
 class TrainingConfig(BaseModel):
@@ -33,14 +37,31 @@ class TrainingConfig(BaseModel):
     method: Method
     description: str
     """One sentence on the method, for those who look at the model."""
-    network: NetworkConfig
+    network: AnyNetworkConfig
     history_frames: int = Field(default=5, ge=2)
     epochs: int = Field(default=40, ge=1)
     batch_size: int = Field(default=256, ge=1)
+    fit_widths: bool = True
+    """Whether one factor on a CVAE's standard deviations is fitted after training (``calibration``)."""
+    adversarial_batch_size: int = Field(default=256, ge=1)
+    """Pairs in the batches of HalentNet's adversarial parts; at most ``batch_size``."""
+    kl_weight: float = Field(default=100.0, gt=0)
+    """Of KL(q ‖ p), at the end of its annealing; as released, 100."""
+    least_step_likelihood: float = -6.0
+    """nats; see ``objectives.Weights``."""
+    displacement_weight: float = Field(default=0.0, ge=0)
+    """1/m, of the distance of the modes from the truth, expected under p(z | x); as released, 0. The
+    likelihood alone leaves it open which mode is the likeliest: this asks that it be a near one."""
     learning_rate: float = Field(gt=0)
     """At the first step; decays by ``learning_rate_decay`` a step, not below ``least_learning_rate``."""
     learning_rate_decay: float = Field(default=0.9999, gt=0, le=1)
     least_learning_rate: float = Field(default=1e-5, ge=0)
+    cooldown_epochs: int = Field(default=0, ge=0)
+    """The last epochs, over which the learning rate goes down to 0."""
+    precision: Precision = Precision.BFLOAT16
+    """Of convolutions and decoder in training."""
+    start: str | None = None
+    """The trained model (name@version) whose parameters a run began with; None: random ones."""
     gradient_clip: float = Field(default=1.0, gt=0)
     """Bound of the gradient's norm."""
     rotate: bool = True
@@ -49,10 +70,25 @@ class TrainingConfig(BaseModel):
     """How often an epoch shows a pair whose path is curved."""
     seed: int = 0
 
-    @property
-    def objective(self) -> str:
-        """Name of the objective."""
-        return self.method.value
+    @model_validator(mode="after")
+    def _network_fits_method(self) -> "TrainingConfig":
+        if isinstance(self.network, CoverNetConfig) is not (self.method is Method.COVERNET):
+            raise ValueError(f"a network of kind {self.network.kind} does not learn by {self.method.value}")
+        return self
+
+    @model_validator(mode="after")
+    def _cools_within_the_run(self) -> "TrainingConfig":
+        if self.cooldown_epochs > self.epochs:
+            raise ValueError(f"cooldown_epochs {self.cooldown_epochs} is more than epochs {self.epochs}")
+        return self
+
+    def toml(self) -> str:
+        """The settings as a file for ``load_config``; what is given on the command line is left out."""
+        values = self.model_dump(mode="json", exclude={"method", "start"}, exclude_none=True)
+        network = values.pop("network")
+        # Strings, numbers, booleans and lists of them are written alike in JSON and TOML
+        lines = [f"{name} = {json.dumps(value)}" for name, value in values.items()]
+        return "\n".join([*lines, "", "[network]", *(f"{n} = {json.dumps(v)}" for n, v in network.items())])
 
 
 def parse_method(name: str) -> Method:
@@ -81,6 +117,8 @@ def load_config(method: Method, file: Path | None = None, **changes: object) -> 
     source = resources.files("model.training") / "methods" / f"{method.value}.toml" if file is None else file
     try:
         values = tomllib.loads(source.read_text(encoding="utf-8"))
+        if "start" in values:
+            raise TrainingError(f"{source}: start is a checkpoint's folder, to be given to train itself")
         given = {name: value for name, value in changes.items() if value is not None}
         config = TrainingConfig.model_validate({"method": method, **values, **given})
     except OSError as error:
@@ -92,6 +130,4 @@ def load_config(method: Method, file: Path | None = None, **changes: object) -> 
         raise TrainingError(f"{source}: {error}") from error
     if config.method is not method:
         raise TrainingError(f"{source}: is of method {config.method.value}, not {method.value}")
-    if config.objective not in OBJECTIVES:
-        raise TrainingError(f"{source}: there is no objective {config.objective}")
     return config

@@ -28,6 +28,8 @@ class ContextTerms(NamedTuple):
     """[N, K], of q(z | x, y), clipped."""
     step_density: Tensor
     """[N, K, T], log-density of the true position under each mode, 1/m² inside the log."""
+    displacement: Tensor
+    """[N, K, T], m, from each mode's mean to the true position."""
 
     @property
     def log_prior(self) -> Tensor:
@@ -67,8 +69,19 @@ def context_terms(
     prior = network.prior(encoding, context).clamp(-logit_clip, logit_clip)
     posterior = network.posterior(encoding, features, future / scale, context).clamp(-logit_clip, logit_clip)
     positions = network.decode(encoding, features, context, future.shape[1], sample_controls)
-    density = guarded_log_density(future[:, None] - positions.mean, positions.covariance)
-    return ContextTerms(prior, posterior, density)
+    offset = future[:, None] - positions.mean
+    density = guarded_log_density(offset, positions.covariance)
+    return ContextTerms(prior, posterior, density, offset.norm(dim=-1))
+
+
+def expected_displacement(log_prior: Tensor, displacement: Tensor) -> Tensor:
+    """Distance from the modes to the truth, expected under the prior and summed over the steps: [N], m.
+
+    Args:
+        log_prior: [N, K], log p(z | x).
+        displacement: [N, K, T], m.
+    """
+    return (log_prior.exp() * displacement.sum(dim=-1)).sum(dim=-1)
 
 
 def log_likelihood(

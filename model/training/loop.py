@@ -1,26 +1,27 @@
 """The training loop."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
-import torch.distributed
 from safetensors.torch import load_file, save_file
-from torch import Tensor
+from torch import Tensor, nn
 
-from model.cvae import CvaeNetworks
-from model.networks.network import AgentNetwork
-from model.scene import AgentType
-from model.training.annealing import KL_WEIGHT, Z_LOGIT_CLIP, learning_rate
-from model.training.config import TrainingConfig
-from model.training.objectives import OBJECTIVES, Weights
+from model.network_forecaster import Networks
+from model.training import processes
+from model.training.annealing import ANNEALED, KL_SHARE, Z_LOGIT_CLIP, cooldown, learning_rate
+from model.training.config import TrainingConfig, TrainingError
+from model.training.learner import Batch
+from model.training.learners import make_learner
+from model.training.objectives import Weights
 from model.training.sampling import epoch_order, epoch_seed, random_turns
 from model.training.source import BatchSource
 from model.training.state import Progress, load_state, save_state
 
-Validate = Callable[[CvaeNetworks], dict[str, float]]
+Validate = Callable[[Networks[Any]], dict[str, float]]
 """Networks (in evaluation mode) → figures by name; ``SCORE`` among them."""
 Report = Callable[[Progress, dict[str, float]], None]
 """Told of each epoch: where the run stands, and the epoch's figures."""
@@ -31,6 +32,10 @@ SCORE = "fde_ml_6s_m"
 """The figure that the best epoch is chosen by, the smaller the better."""
 BEST_FILE = "best.safetensors"
 """Parameters of the best epoch, in the run's folder."""
+
+
+LEAST_SHARE = 0.5
+"""Of a network's parameters that a start has to bring."""
 
 
 class Trainer:
@@ -45,6 +50,7 @@ class Trainer:
         validate: judges networks after each epoch.
         folder: where state and best parameters are kept.
         device: of the networks.
+        start: parameters to begin with, where they fit; the others begin random.
     """
 
     def __init__(
@@ -54,6 +60,7 @@ class Trainer:
         validate: Validate,
         folder: Path,
         device: torch.device,
+        start: Mapping[str, Tensor] | None = None,
     ) -> None:
         self.config = config
         self._train = train
@@ -61,9 +68,13 @@ class Trainer:
         self._folder = folder
         self._device = device
         torch.manual_seed(config.seed)  # initial parameters are the same in every process
-        self.networks = CvaeNetworks(config.network).to(device)
-        self.optimizer = torch.optim.Adam(self.networks.parameters(), lr=config.learning_rate)
-        resumed = load_state(folder, config, self.networks, self.optimizer)
+        self.learner = make_learner(config, train, device)
+        self.networks = self.learner.networks
+        if start is not None:
+            begin_with(self.networks, start)
+        shown = len(epoch_order(train.turned, config.curved_copies, config.seed, epoch=0))
+        self._epoch_steps = shown // config.batch_size or 1
+        resumed = load_state(folder, config, self.learner)
         self.progress = resumed or Progress(epoch=0, step=0, best_epoch=0, best_score=None, seconds=0.0)
 
     def run(self, report: Report, tick: Tick) -> None:
@@ -75,9 +86,9 @@ class Trainer:
         """
         while self.progress.epoch < self.config.epochs:
             figures = self._epoch(tick)
-            if _rank() == 0:
+            if processes.rank() == 0:
                 figures |= self._judge()
-                save_state(self._folder, self.config, self.progress, self.networks, self.optimizer)
+                save_state(self._folder, self.config, self.progress, self.learner)
                 report(self.progress, figures)
 
     def best(self) -> dict[str, Tensor]:
@@ -102,69 +113,68 @@ class Trainer:
 
     def _epoch(self, tick: Tick) -> dict[str, float]:
         """One epoch of steps; returns the mean of each term, the learning rate and the seconds."""
-        config, epoch = self.config, self.progress.epoch
+        config, epoch, steps = self.config, self.progress.epoch, self._epoch_steps
         # What is random in an epoch hangs on its number alone
-        torch.manual_seed(epoch_seed(config.seed, epoch) + _rank())
+        torch.manual_seed(epoch_seed(config.seed, epoch) + processes.rank())
         generator = torch.Generator().manual_seed(epoch_seed(config.seed, epoch))
         order = epoch_order(self._train.turned, config.curved_copies, config.seed, epoch)
-        batches = len(order) // config.batch_size or 1
-        self.networks.train()
-        network = self.networks.of(AgentType.VEHICLE)
+        for module in self.learner.modules().values():
+            module.train()
         started = time.perf_counter()
         sums: dict[str, Tensor] = {}
-        for done, indices in enumerate(_split(order, config.batch_size, batches), start=1):
-            turns = random_turns(len(indices), generator) if config.rotate else None
-            mine = slice(_rank(), None, _world())
-            terms = self._step(network, indices[mine], None if turns is None else turns[mine])
+        sizes = self.learner.batch_sizes
+        for done in range(1, steps + 1):
+            # Every part of a step goes through all pairs, each begins elsewhere in their order
+            numbers = ((done - 1 + part * steps // len(sizes)) % steps for part in range(len(sizes)))
+            batches = [self._batch(order, n, size, generator) for n, size in zip(numbers, sizes, strict=True)]
+            terms = self._step(batches)
             for name, term in terms.items():
                 sums[name] = sums.get(name, torch.zeros((), device=self._device)) + term
-            tick(done, batches)
-        means = {name: (total / batches).item() for name, total in sums.items()}
+            tick(done, steps)
+        means = {name: (total / steps).item() for name, total in sums.items()}
         seconds = time.perf_counter() - started
         self.progress = replace(self.progress, epoch=epoch + 1, seconds=self.progress.seconds + seconds)
         return means | {"learning_rate": self._rate(), "seconds": seconds}
 
-    def _step(self, network: AgentNetwork, indices: Tensor, turns: Tensor | None) -> dict[str, Tensor]:
-        config, step = self.config, self.progress.step
-        features, future = self._train.batch(indices, turns)
-        weights = Weights(KL_WEIGHT(step), Z_LOGIT_CLIP(step))
-        loss = OBJECTIVES[config.objective](network, features, future, weights)
-        for group in self.optimizer.param_groups:
-            group["lr"] = self._rate()
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.value.backward()
-        _average_gradients(self.networks)
-        torch.nn.utils.clip_grad_norm_(self.networks.parameters(), config.gradient_clip)
-        self.optimizer.step()
+    def _batch(self, order: Tensor, number: int, size: int, generator: torch.Generator) -> Batch:
+        """This process's share of the first ``size`` of a batch. Batches are whole ones: in a small last
+        one the mutual information would be noisy."""
+        start = number * self.config.batch_size
+        indices = order[start : start + size]
+        turns = random_turns(len(indices), generator) if self.config.rotate else None
+        mine = slice(processes.rank(), None, processes.world())
+        return Batch(*self._train.batch(indices[mine], None if turns is None else turns[mine]))
+
+    def _step(self, batches: Sequence[Batch]) -> dict[str, Tensor]:
+        step = self.progress.step
+        annealed = step if self.config.start is None else step + ANNEALED
+        weights = Weights(
+            self.config.kl_weight * KL_SHARE(annealed),
+            Z_LOGIT_CLIP(annealed),
+            least_step_likelihood=self.config.least_step_likelihood,
+            displacement=self.config.displacement_weight,
+        )
+        terms = self.learner.step(batches, weights, self._rate())
         self.progress = replace(self.progress, step=step + 1)
-        return {"loss": loss.value.detach()} | {name: term.detach() for name, term in loss.terms.items()}
+        return terms
 
     def _rate(self) -> float:
-        config = self.config
-        return learning_rate(
-            config.learning_rate, self.progress.step, config.learning_rate_decay, config.least_learning_rate
+        config, step, steps = self.config, self.progress.step, self._epoch_steps
+        rate = learning_rate(
+            config.learning_rate, step, config.learning_rate_decay, config.least_learning_rate
         )
+        return rate * cooldown(step, config.epochs * steps, config.cooldown_epochs * steps)
 
 
-def _split(order: Tensor, size: int, batches: int) -> Iterator[Tensor]:
-    """Whole batches only: a small last one would have a noisy mutual information."""
-    for number in range(batches):
-        yield order[number * size : (number + 1) * size]
+def begin_with(networks: nn.Module, given: Mapping[str, Tensor]) -> None:
+    """Puts parameters into networks where names and shapes fit; what is computed (buffers) stays.
 
-
-def _world() -> int:
-    return torch.distributed.get_world_size() if torch.distributed.is_initialized() else 1
-
-
-def _rank() -> int:
-    return torch.distributed.get_rank() if torch.distributed.is_initialized() else 0
-
-
-def _average_gradients(module: torch.nn.Module) -> None:
-    """Means of the gradients over all processes."""
-    if _world() == 1:
-        return
-    for parameter in module.parameters():
-        if parameter.grad is not None:
-            torch.distributed.all_reduce(parameter.grad)
-            parameter.grad /= _world()
+    Raises:
+        TrainingError: they are not even half of the networks' parameters: this is no start.
+    """
+    wanted = dict(networks.named_parameters())
+    fitting = {n: t for n, t in given.items() if n in wanted and wanted[n].shape == t.shape}
+    share = sum(t.numel() for t in fitting.values()) / sum(p.numel() for p in wanted.values())
+    if share < LEAST_SHARE:
+        raise TrainingError(f"start: fits {share:.0%} of the network's parameters only")
+    networks.load_state_dict(fitting, strict=False)

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from model.forecaster import Context, Features
@@ -15,6 +14,7 @@ from model.training.elbo import (
     clamped_divergence,
     context_terms,
     divergence,
+    expected_displacement,
     log_likelihood,
     mutual_information,
 )
@@ -27,6 +27,11 @@ class Weights:
     kl: float
     logit_clip: float
     sample_controls: bool = True
+    least_step_likelihood: float = -6.0
+    """nats; in CAB, Reweight and RUBiZ a step's log-likelihood is clamped there from below. As released, −6:
+    what is forecast worse than that then has no gradient."""
+    displacement: float = 0.0
+    """1/m, of ``elbo.expected_displacement``; 0, as released, leaves it out."""
 
 
 class Loss(NamedTuple):
@@ -50,7 +55,7 @@ BLIND_KL = 5.0
 def trajectron(network: AgentNetwork, features: Features, future: Tensor, weights: Weights) -> Loss:
     """Trajectron++ (also without context: that is in the network's shape)."""
     full = _terms(network, features, future, Context.FULL, weights)
-    bound = _bound(full.prior_logits, full.posterior_logits, full.step_density, weights, least=None)
+    bound = _bound(full, weights, bounded=False)
     return Loss(bound.value(), bound.named())
 
 
@@ -60,7 +65,7 @@ def cab(network: AgentNetwork, features: Features, future: Tensor, weights: Weig
     As released, the gradient stops at the blind encoding.
     """
     full, blind = _both(network, features, future, weights)
-    bounds = [_bound(*terms, weights) for terms in (full, blind)]
+    bounds = [_bound(terms, weights) for terms in (full, blind)]
     apart = divergence(full.log_prior, blind.log_prior.detach())
     value = bounds[0].value() + bounds[1].value() - BLIND_KL * apart
     return Loss(value, bounds[0].named("full") | bounds[1].named("blind") | {"kl_full_blind": apart})
@@ -69,7 +74,7 @@ def cab(network: AgentNetwork, features: Features, future: Tensor, weights: Weig
 def reweight(network: AgentNetwork, features: Features, future: Tensor, weights: Weights) -> Loss:
     """Reweight: agents that the blind forecast misses count more."""
     full, blind = _both(network, features, future, weights)
-    bounds = [_bound(*terms, weights) for terms in (full, blind)]
+    bounds = [_bound(terms, weights) for terms in (full, blind)]
     share = torch.sigmoid(-bounds[1].likelihood).detach()
     value = bounds[0].value() + bounds[1].value() - (share * bounds[0].likelihood).mean()
     return Loss(value, bounds[0].named("full") | bounds[1].named("blind") | {"share": share.mean()})
@@ -82,9 +87,10 @@ def rubiz(network: AgentNetwork, features: Features, future: Tensor, weights: We
         full.prior_logits.sigmoid() * blind.prior_logits.sigmoid(),
         full.posterior_logits.sigmoid() * blind.posterior_logits.sigmoid(),
         full.step_density,
+        full.displacement,
     )
     bounds = {
-        name: _bound(*terms, weights) for name, terms in (("full", full), ("blind", blind), ("fused", fused))
+        name: _bound(terms, weights) for name, terms in (("full", full), ("blind", blind), ("fused", fused))
     }
     value = bounds["full"].value(RUBIZ_FULL) + bounds["blind"].value() + bounds["fused"].value()
     return Loss(
@@ -98,8 +104,10 @@ OBJECTIVES: dict[str, Objective] = {
     "cab": cab,
     "reweight": reweight,
     "rubiz": rubiz,
+    "halentnet": trajectron,
+    "halentnet-no-context": trajectron,
 }
-"""By the method's name."""
+"""By the method's name; of HalentNet, its CVAE step."""
 
 
 class _Bound(NamedTuple):
@@ -109,32 +117,34 @@ class _Bound(NamedTuple):
     """[N], log p(y | x)."""
     kl: Tensor
     information: Tensor
+    displacement: Tensor | None
+    """m; None: it has no weight."""
     weights: Weights
 
     def value(self, likelihood_weight: float = 1.0) -> Tensor:
         """What is minimised."""
-        return -likelihood_weight * self.likelihood.mean() + self.weights.kl * self.kl - self.information
+        value = -likelihood_weight * self.likelihood.mean() + self.weights.kl * self.kl - self.information
+        return value if self.displacement is None else value + self.weights.displacement * self.displacement
 
     def named(self, context: str = "") -> dict[str, Tensor]:
         """Its terms for the log."""
         suffix = f"_{context}" if context else ""
         terms = {"log_likelihood": self.likelihood.mean(), "kl": self.kl}
         terms["mutual_information"] = self.information
+        if self.displacement is not None:
+            terms["displacement"] = self.displacement
         return {name + suffix: term.detach() for name, term in terms.items()}
 
 
-def _bound(
-    prior_logits: Tensor,
-    posterior_logits: Tensor,
-    step_density: Tensor,
-    weights: Weights,
-    least: float | None = -MOST_STEP_LIKELIHOOD,
-) -> _Bound:
-    log_prior, log_posterior = F.log_softmax(prior_logits, -1), F.log_softmax(posterior_logits, -1)
+def _bound(terms: ContextTerms, weights: Weights, bounded: bool = True) -> _Bound:
+    log_prior, log_posterior = terms.log_prior, terms.log_posterior
+    least = weights.least_step_likelihood if bounded else None
+    displaced = expected_displacement(log_prior, terms.displacement).mean() if weights.displacement else None
     return _Bound(
-        log_likelihood(log_posterior, step_density, least, MOST_STEP_LIKELIHOOD),
+        log_likelihood(log_posterior, terms.step_density, least, MOST_STEP_LIKELIHOOD),
         clamped_divergence(log_posterior, log_prior),
         mutual_information(log_prior),
+        displaced,
         weights,
     )
 

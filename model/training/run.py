@@ -7,16 +7,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-import torch.distributed
 
-from model.checkpoint import load_checkpoint, save_checkpoint
+from model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from model.cvae import CvaeNetworks
 from model.data.batches import Batches
-from model.data.cache import Cache, build_cache
-from model.data.cache_layout import CacheKey
+from model.data.cache import Cache
+from model.data.caches import open_cache
 from model.data.nuscenes_pred import NuscenesPredReader
-from model.data.scenes import DataError, Reader
+from model.data.scenes import Reader
 from model.forecaster import ModelInfo, Protocol
-from model.networks.config import BlindContext
+from model.scene import AgentType
+from model.training import processes
+from model.training.calibration import fit_width, widen
 from model.training.card import LICENSE, Origin, model_card
 from model.training.config import TrainingConfig, TrainingError
 from model.training.logs import RunLog
@@ -98,10 +100,11 @@ class Run:
     """Folder of the caches; runs may share it."""
     version: str
     """Of the checkpoint."""
+    start: Checkpoint | None = None
+    """Whose parameters to begin with."""
 
     def train(
         self,
-        command: str,
         report: Report,
         tick: Callable[[int, int, int], None],
         said: Callable[[str], None],
@@ -109,7 +112,6 @@ class Run:
         """Trains, resuming what is in ``out``, and writes the best epoch as a checkpoint.
 
         Args:
-            command: how the run was started, for its card.
             report: told of each epoch, in the first process only.
             tick: told of each step: epoch, batches done, batches in the epoch.
             said: told in words what else goes on.
@@ -122,13 +124,13 @@ class Run:
             DataError: the data is bad.
         """
         device = _device()
-        first = _join_processes(device)
-        train, judged = (
-            self._open_cache(s, said) for s in (self.source.train_split, self.source.validation_split)
-        )
+        first = processes.join(device)
+        splits = (self.source.train_split, self.source.validation_split)
+        train, judged = processes.first_alone(lambda: [self._open_cache(split, said) for split in splits])
         validation = Validation(judged, self.config.network, device)
         batches = Batches(train, device, self.config.network)
-        trainer = Trainer(self.config, batches, validation, self.out, device)
+        parameters = None if self.start is None else self.start.tensors
+        trainer = Trainer(self.config, batches, validation, self.out, device, parameters)
         with RunLog(self.out) as log:
 
             def add(progress: Progress, figures: dict[str, float]) -> None:
@@ -139,29 +141,49 @@ class Run:
         if first:
             data = f"{self.source.kind}, split {self.source.train_split}: {len(train)} pairs"
             split = f"{self.source.kind}, split {self.source.validation_split} ({len(judged)} pairs)"
-            origin = Origin(data, self.source.protocol, split, command, _machine())
-            self._write_checkpoint(trainer, validation, origin)
+            origin = Origin(data, self.source.protocol, split, self._command(), _machine())
+            self._write_checkpoint(trainer, batches, validation, origin)
         return self.out / "checkpoint"
+
+    def _command(self) -> str:
+        """What repeats the run, in terms of any machine."""
+        source = self.source
+        start = "" if self.start is None else " --start START"
+        return (
+            f"cab-forecast train {self.config.method.value} --data {source.kind}:DATA "
+            f"--protocol {source.protocol.value} --train-split {source.train_split} "
+            f"--validation-split {source.validation_split} --version {self.version} "
+            f"--config SETTINGS.toml{start} --out OUT"
+        )
 
     def _open_cache(self, split: str, said: Callable[[str], None]) -> Cache:
         """The cache of a split, made first where it is not there or stale."""
         source, config = self.source, self.config
-        reader = source.reader()
-        key = CacheKey.of(reader, split, source.protocol, config.network, config.history_frames)
-        kinds = "".join(kind.value[0] for kind in config.network.neighbor_types) or "none"
-        name = f"{source.kind}-{split}-{source.protocol.value}-{config.history_frames}-{kinds}"
-        try:
-            return Cache.open(self.cache / name, key)
-        except DataError as error:
-            said(f"making the cache of {split}: {error}")
-        build_cache(reader, split, source.protocol, config.network, config.history_frames, self.cache / name)
-        return Cache.open(self.cache / name, key)
+        return open_cache(
+            self.cache,
+            source.reader(),
+            source.kind,
+            split,
+            source.protocol,
+            config.network,
+            config.history_frames,
+            said,
+        )
 
-    def _write_checkpoint(self, trainer: Trainer, validation: Validation, origin: Origin) -> None:
-        config, network = self.config, self.config.network
+    def _write_checkpoint(
+        self, trainer: Trainer, train: Batches, validation: Validation, origin: Origin
+    ) -> None:
+        # The networks' own: what is made when training begins is known there only
+        config, network = self.config, trainer.networks.config
         trainer.networks.load_state_dict(trainer.best())
         trainer.networks.eval()
+        width = None
+        if config.fit_widths and isinstance(trainer.networks, CvaeNetworks):
+            vehicles = trainer.networks.of(AgentType.VEHICLE)
+            width = fit_width(vehicles, train)
+            widen(vehicles, width)
         figures = validation.judge(trainer.networks, samples=SAMPLES, draws=DRAWS)
+        begun = "" if config.start is None else f"; begun with {config.start}"
         info = ModelInfo(
             name=config.method.value,
             version=self.version,
@@ -173,13 +195,13 @@ class Run:
             modes=network.modes,
             uses_map=network.uses_map,
             uses_neighbors=bool(network.neighbor_types),
-            supports_blind=network.blind is not BlindContext.NONE,
-            trained_on=f"{origin.data}; {trainer.progress.epoch} epochs, seed {config.seed}",
+            supports_blind=network.supports_blind,
+            trained_on=f"{origin.data}; {trainer.progress.epoch} epochs, seed {config.seed}{begun}",
             benchmark={name: round(value, 6) for name, value in figures.items()},
             license=LICENSE,
         )
         tensors = {name: tensor.cpu() for name, tensor in trainer.networks.state_dict().items()}
-        card = model_card(config, origin, trainer.progress, self.version, figures)
+        card = model_card(config, origin, trainer.progress, self.version, figures, width)
         folder = self.out / "checkpoint"
         save_checkpoint(folder, info, network, tensors, card)
         load_checkpoint(folder).forecaster()  # what cannot be read again is no checkpoint
@@ -189,14 +211,6 @@ def _device() -> torch.device:
     if not torch.cuda.is_available():
         return torch.device("cpu")
     return torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
-
-
-def _join_processes(device: torch.device) -> bool:
-    """Joins the other processes of torchrun, if any; whether this is the first."""
-    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
-        return True
-    torch.distributed.init_process_group("nccl" if device.type == "cuda" else "gloo")
-    return torch.distributed.get_rank() == 0
 
 
 def _machine() -> str:

@@ -19,6 +19,11 @@ class BatchSource(Interface):
         """[P], rad, how far each pair's path turns from its oldest to its farthest frame."""
         ...
 
+    @property
+    def paths(self) -> Tensor:
+        """[P, T, 2], m, each pair's future in its agent's own frame: x ahead, y to the left; on the CPU."""
+        ...
+
     def batch(self, indices: Tensor, turns: Tensor | None = None) -> tuple[Features, Tensor]:
         """Features of n pairs, and their futures [n, T, 2], m, relative to now.
 

@@ -10,6 +10,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from model.training.config import TrainingConfig, TrainingError
+from model.training.learner import Learner
 
 _TENSORS = "state.safetensors"
 _PROGRESS = "state.json"
@@ -31,19 +32,18 @@ class Progress:
     """Spent in training steps so far."""
 
 
-def save_state(
-    folder: Path,
-    config: TrainingConfig,
-    progress: Progress,
-    networks: torch.nn.Module,
-    optimizer: torch.optim.Optimizer,
-) -> None:
+def save_state(folder: Path, config: TrainingConfig, progress: Progress, learner: Learner) -> None:
     """Writes the state; whoever is interrupted in it finds the one before."""
-    names = [name for name, _ in networks.named_parameters()]
-    tensors: dict[str, Tensor] = {f"network.{k}": v for k, v in networks.state_dict().items()}
-    for index, moments in optimizer.state_dict()["state"].items():
-        for name, value in moments.items():
-            tensors[f"optimizer.{names[index]}.{name}"] = value
+    tensors: dict[str, Tensor] = {
+        f"{module}.{name}": tensor
+        for module, networks in learner.modules().items()
+        for name, tensor in networks.state_dict().items()
+    }
+    names = _parameter_names(learner)
+    for name, optimizer in learner.optimizers.items():
+        for parameter in _parameters(optimizer):
+            moments: dict[str, Tensor] = optimizer.state.get(parameter, {})
+            tensors |= {f"{name}.{names[parameter]}.{moment}": value for moment, value in moments.items()}
     folder.mkdir(parents=True, exist_ok=True)
     # The progress names its tensors' file, and is replaced last: the pair is never of two states
     file = f"{progress.epoch:04d}.{_TENSORS}"
@@ -57,9 +57,7 @@ def save_state(
             old.unlink()
 
 
-def load_state(
-    folder: Path, config: TrainingConfig, networks: torch.nn.Module, optimizer: torch.optim.Optimizer
-) -> Progress | None:
+def load_state(folder: Path, config: TrainingConfig, learner: Learner) -> Progress | None:
     """Puts a saved state back; None where there is none.
 
     Raises:
@@ -74,25 +72,44 @@ def load_state(
         progress = Progress(**document["progress"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TrainingError(f"{file}: cannot be resumed: {error}") from error
-    _check_same(file, document["config"], config)
-    device = next(networks.parameters()).device
-    networks.load_state_dict(_under("network.", tensors))
-    moments = _under("optimizer.", tensors)
-    state = optimizer.state_dict()
-    state["state"] = {}
-    for index, (name, _) in enumerate(networks.named_parameters()):
-        own = _under(f"{name}.", moments)
-        if own:
-            state["state"][index] = {key: t if key == "step" else t.to(device) for key, t in own.items()}
-    optimizer.load_state_dict(state)
+    _check_same(file, document["config"], config, progress.epoch)
+    for name, networks in learner.modules().items():
+        networks.load_state_dict(_under(f"{name}.", tensors))
+    names = _parameter_names(learner)
+    for name, optimizer in learner.optimizers.items():
+        moments = _under(f"{name}.", tensors)
+        for parameter in _parameters(optimizer):
+            own = _under(f"{names[parameter]}.", moments)
+            if own:
+                optimizer.state[parameter] = {
+                    key: t if key == "step" else t.to(parameter.device) for key, t in own.items()
+                }
     return progress
 
 
-def _check_same(file: Path, saved: Mapping[str, object], config: TrainingConfig) -> None:
+def _parameters(optimizer: torch.optim.Optimizer) -> list[torch.nn.Parameter]:
+    """All that an optimiser changes."""
+    return [parameter for group in optimizer.param_groups for parameter in group["params"]]
+
+
+def _parameter_names(learner: Learner) -> dict[torch.nn.Parameter, str]:
+    """Of all networks; no name is in two of them."""
+    return {p: name for networks in learner.modules().values() for name, p in networks.named_parameters()}
+
+
+def _check_same(file: Path, saved: Mapping[str, object], config: TrainingConfig, done: int) -> None:
     now = config.model_dump(mode="json")
-    other = sorted(k for k in now if k != "epochs" and saved.get(k) != now[k])
+    other = {k for k in now if k != "epochs" and saved.get(k) != now[k]}
+    # More or fewer epochs are no other setting until the end's cooling has begun
+    shortest = min(int(str(saved.get("epochs", 0))), config.epochs)
+    if (
+        config.cooldown_epochs
+        and saved.get("epochs") != config.epochs
+        and done > shortest - config.cooldown_epochs
+    ):
+        other.add("epochs")
     if other:
-        raise TrainingError(f"{file}: is of a run with other settings: {', '.join(other)}")
+        raise TrainingError(f"{file}: is of a run with other settings: {', '.join(sorted(other))}")
 
 
 def _under(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -1,19 +1,49 @@
 """Judges networks on a split."""
 
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 import torch
 
-from model.cvae import CvaeNetworks
+from model.arrays import Floats
 from model.data.batches import Batches
 from model.data.cache import Cache
-from model.forecaster import Context
+from model.forecaster import Context, Features
 from model.metrics.aggregate import MetricMeans
 from model.metrics.evaluate import instance_metrics
 from model.mixture import TrajectoryMixture
-from model.networks.config import NetworkConfig
-from model.scene import AgentType
+from model.network_forecaster import Networks
+from model.networks.config import AnyNetworkConfig
+from model.scene import AgentType, Raster
 
 BATCH = 512
+
+
+@dataclass(frozen=True)
+class JudgedBatch:
+    """N pairs, and what their forecasts are judged by."""
+
+    features: Features
+    """Full context, on the device."""
+    truth: Floats
+    """[N, 12, 2], m, ground frame."""
+    rasters: Sequence[Raster]
+    """N; pairs of a scene share one."""
+    seeds: Sequence[int]
+    """N, the pairs' numbers in the split: what is drawn for a pair does not hang on its batch."""
+
+    def metrics(self, mixture: TrajectoryMixture, samples: int, draws: int) -> dict[str, Floats]:
+        """``instance_metrics`` of forecasts of these pairs.
+
+        Args:
+            mixture: the forecasts.
+            samples: trajectories drawn for each pair; 0 leaves such figures out.
+            draws: for calibration; 0 leaves it out.
+        """
+        seeds = self.seeds if samples or draws else None
+        return instance_metrics(mixture, self.truth, self.rasters, seeds, samples=samples, draws=draws)
 
 
 class Validation:
@@ -21,21 +51,24 @@ class Validation:
 
     Args:
         cache: the split.
-        config: of the networks.
+        config: of the networks; None: features of all that the cache has.
         device: where they are.
     """
 
-    def __init__(self, cache: Cache, config: NetworkConfig, device: torch.device) -> None:
+    def __init__(self, cache: Cache, config: AnyNetworkConfig | None, device: torch.device) -> None:
         self._cache = cache
         self._batches = Batches(cache, device, config)
-        self._rasters = [cache.raster(scene) for scene in range(len(cache.manifest.scenes))]
 
-    def __call__(self, networks: CvaeNetworks) -> dict[str, float]:
+    def __call__(self, networks: Networks[Any]) -> dict[str, float]:
         """The figures that need no samples, quick enough for after each epoch."""
         return self.judge(networks, samples=0, draws=0)
 
+    def __len__(self) -> int:
+        """How many pairs there are."""
+        return len(self._batches)
+
     @torch.no_grad()
-    def judge(self, networks: CvaeNetworks, samples: int, draws: int) -> dict[str, float]:
+    def judge(self, networks: Networks[Any], samples: int, draws: int) -> dict[str, float]:
         """All figures.
 
         Args:
@@ -45,13 +78,24 @@ class Validation:
         """
         network = networks.of(AgentType.VEHICLE)
         means = MetricMeans()
-        for start in range(0, len(self._batches), BATCH):
-            indices = torch.arange(start, min(start + BATCH, len(self._batches)))
-            features, future = self._batches.batch(indices)
-            log_weights, positions = network(features, Context.FULL, future.shape[1])
+        for batch in self.batches():
+            features = batch.features
+            log_weights, positions = network(features, Context.FULL, batch.truth.shape[1])
             mixture = TrajectoryMixture(log_weights, positions.mean, positions.covariance, features["origin"])
-            truth = (future.double() + features["origin"][:, None]).cpu().numpy()
-            rasters = [self._rasters[int(scene)] for scene in self._cache.scene[indices.numpy()]]
-            seeds = indices.tolist() if samples or draws else None
-            means.add(instance_metrics(mixture, truth, rasters, seeds, samples=samples, draws=draws))
+            means.add(batch.metrics(mixture, samples, draws))
         return {name: value for name, value in means.means().items() if np.isfinite(value)}
+
+    def batches(self, limit: int | None = None) -> Iterator[JudgedBatch]:
+        """The pairs in order, some at a time; only the maps of those are in memory.
+
+        Args:
+            limit: how many of the first pairs; None: all.
+        """
+        count = len(self) if limit is None else min(limit, len(self))
+        for start in range(0, count, BATCH):
+            indices = torch.arange(start, min(start + BATCH, count))
+            features, future = self._batches.batch(indices)
+            truth = (future.double() + features["origin"][:, None]).cpu().numpy()
+            scenes = self._cache.scene[indices.numpy()].tolist()
+            rasters = {scene: self._cache.raster(scene) for scene in set(scenes)}
+            yield JudgedBatch(features, truth, [rasters[scene] for scene in scenes], indices.tolist())

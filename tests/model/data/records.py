@@ -95,6 +95,11 @@ class FixedReader:
         self._fails = fails
 
     @property
+    def place(self) -> str:
+        """Nowhere."""
+        return "made up"
+
+    @property
     def splits(self) -> tuple[str, ...]:
         """One with the records and one without."""
         return ("some", "none")

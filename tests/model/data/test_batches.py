@@ -1,6 +1,7 @@
 """Batches against the features that are made one scene at a time."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +14,9 @@ from model.data.protocols import frame_scene
 from model.data.scenes import DataError, SceneRecord
 from model.features import scene_features
 from model.forecaster import Context, Protocol, join
-from model.networks.config import NetworkConfig
+from model.networks.config import CoverNetConfig, NetworkConfig
+from model.networks.covernet import present_heading
+from model.networks.covernet import turned as turned_vectors
 from model.scene import AgentType
 from tests.model.data.records import FixedReader, raster, record, turned
 
@@ -123,6 +126,26 @@ def test_a_network_that_sees_less_gets_less(cache: Cache) -> None:
     assert features.keys() == {"origin", "velocity", "history", "first"}
     with pytest.raises(DataError, match="neighbours"):
         Batches(cache, CPU, NetworkConfig(neighbor_types=(AgentType.VEHICLE,)))
+
+
+def test_batches_with_boxes(cache: Cache, tmp_path: Path) -> None:
+    config = CoverNetConfig()
+    build_cache(FixedReader(*RECORDS[:2]), "some", Protocol.CAUSAL, config, 5, tmp_path / "cache")
+    drawn = Cache.open(tmp_path / "cache")
+    batches = Batches(drawn, CPU, config)
+    rows = torch.arange(len(drawn))
+    plain, future = batches.batch(rows)
+    assert plain.keys() == {"origin", "velocity", "history", "first", "surroundings", "map"}
+    turned_features, turned_future = batches.batch(rows, torch.full((len(rows),), 2.0))
+    torch.testing.assert_close(turned_features["surroundings"], plain["surroundings"])
+    # In the agents' own frames the futures are what they were
+    for features, truth in ((plain, future), (turned_features, turned_future)):
+        own = turned_vectors(truth, -present_heading(features))
+        torch.testing.assert_close(own, batches.paths, rtol=1e-4, atol=1e-4)
+    with pytest.raises(DataError, match="boxes"):
+        Batches(drawn, CPU, NetworkConfig())
+    with pytest.raises(DataError, match="summed histories"):
+        Batches(cache, CPU, config)
 
 
 def test_turned_batches(cache: Cache) -> None:

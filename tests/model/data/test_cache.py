@@ -14,7 +14,8 @@ from model.data.protocols import frame_scene
 from model.data.scenes import DataError, Pair, SceneRecord
 from model.features import scene_features
 from model.forecaster import Context, Protocol
-from model.networks.config import BlindContext, NetworkConfig
+from model.inputs import network_features
+from model.networks.config import AnyNetworkConfig, BlindContext, CoverNetConfig, NetworkConfig
 from model.scene import AgentType
 from tests.model.data.records import FixedReader, raster, record, track
 
@@ -29,7 +30,7 @@ def _build(
     folder: Path,
     reader: FixedReader = READER,
     protocol: Protocol = Protocol.CAUSAL,
-    config: NetworkConfig = CONFIG,
+    config: AnyNetworkConfig = CONFIG,
 ) -> None:
     build_cache(reader, "some", protocol, config, FRAMES, folder)
 
@@ -92,6 +93,39 @@ def test_data_without_tokens_and_a_network_without_neighbours(tmp_path: Path) ->
     assert not cache.edge_mask.any()
 
 
+def test_a_cache_of_boxes(tmp_path: Path) -> None:
+    config = CoverNetConfig()
+    _build(tmp_path / "cache", config=config)
+    cache = Cache.open(tmp_path / "cache", CacheKey.of(READER, "some", Protocol.CAUSAL, config, FRAMES))
+    assert cache.surroundings is not None
+    assert not cache.neighbors
+    assert not list((tmp_path / "cache").glob("neighbors.*"))
+    pairs = [(whole, pair) for whole in RECORDS for pair in whole.pairs]
+    for row, (whole, pair) in enumerate(pairs):
+        scene, tracks = frame_scene(whole, pair.frame, Protocol.CAUSAL, FRAMES)
+        target = np.flatnonzero(tracks == pair.track)
+        wanted = network_features(scene, target, AgentType.VEHICLE, config, Context.FULL)
+        np.testing.assert_array_equal(cache.surroundings[row], wanted["surroundings"][0].numpy())
+        np.testing.assert_array_equal(cache.history[row], wanted["history"][0].numpy())
+    assert (cache.surroundings[..., 3] > 0).any()
+
+
+def test_caches_of_histories_hold_no_boxes_and_do_not_hang_on_how_they_are_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _build(tmp_path / "histories")
+    _build(tmp_path / "boxes", config=CoverNetConfig())
+    monkeypatch.setattr(cache_layout, "_DRAWN_BY", (cache_layout,))
+    assert Cache.open(tmp_path / "histories").surroundings is None
+    with pytest.raises(DataError, match="build the cache anew"):
+        Cache.open(tmp_path / "boxes")
+    manifest = tmp_path / "histories/manifest.json"
+    content = json.loads(manifest.read_text())
+    content["key"].pop("drawn")  # as before there were boxes
+    manifest.write_text(json.dumps(content))
+    Cache.open(tmp_path / "histories", KEY)
+
+
 def test_progress_is_told_of_each_scene(tmp_path: Path) -> None:
     told: list[SceneRecord] = []
     build_cache(READER, "some", Protocol.CAUSAL, CONFIG, FRAMES, tmp_path / "a/b/cache", told.append)
@@ -119,6 +153,8 @@ def test_methods_share_a_cache(tmp_path: Path) -> None:
         ({"history_frames": 9}, "history_frames is 5, not 9"),
         ({"reader": "NuscenesReader"}, "reader is FixedReader, not NuscenesReader"),
         ({"neighbor_types": ()}, "neighbor_types is"),
+        ({"drawn": True}, "drawn is False, not True"),
+        ({"data": "elsewhere"}, "data is made up, not elsewhere"),
     ],
 )
 def test_a_cache_of_something_else_is_refused(tmp_path: Path, change: dict[str, object], told: str) -> None:

@@ -5,7 +5,9 @@ from torch import Tensor
 
 from model.bench import features
 from model.forecaster import Features
-from model.networks.config import BlindContext, NetworkConfig
+from model.networks.config import AnyNetworkConfig, BlindContext, CoverNetConfig, NetworkConfig
+from model.networks.covernet import present_heading, turned
+from model.surroundings import BOX_NUMBERS, BOXES
 from model.training.config import Method, TrainingConfig
 
 
@@ -14,6 +16,7 @@ class MadeUpPairs:
 
     def __init__(self, pairs: int) -> None:
         self._features = features(pairs)
+        self._features["surroundings"] = torch.zeros(pairs, BOXES, BOX_NUMBERS)
         ahead = 0.5 * torch.arange(1, 13)
         self._future = self._features["velocity"][:, None, :] * ahead[:, None]
         self._turned = torch.linspace(0, 1, pairs)
@@ -26,6 +29,11 @@ class MadeUpPairs:
         """[P], a third of them curved."""
         return self._turned
 
+    @property
+    def paths(self) -> Tensor:
+        """[P, 12, 2], the futures in the agents' own frames."""
+        return turned(self._future, -present_heading(self._features))
+
     def batch(self, indices: Tensor, turns: Tensor | None = None) -> tuple[Features, Tensor]:
         """As a BatchSource; turning is left out."""
         return {name: t[indices] for name, t in self._features.items()}, self._future[indices]
@@ -36,12 +44,16 @@ def small_config(method: Method = Method.CAB, epochs: int = 2, **changes: object
     blind = {Method.CAB: BlindContext.NULL, Method.TRAJECTRON: BlindContext.NONE}.get(
         method, BlindContext.OWN
     )
+    network: AnyNetworkConfig = NetworkConfig(blind=blind, modes=5)
+    if method is Method.COVERNET:
+        network = CoverNetConfig(modes=5)
     values: dict[str, object] = {
         "method": method,
         "description": "A test.",
-        "network": NetworkConfig(blind=blind, modes=5),
+        "network": network,
         "learning_rate": 0.003,
         "epochs": epochs,
         "batch_size": 16,
+        "adversarial_batch_size": 2,
     }
     return TrainingConfig.model_validate(values | changes)

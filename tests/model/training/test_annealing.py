@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from model.training.annealing import KL_WEIGHT, Z_LOGIT_CLIP, Sigmoid, learning_rate
+from model.training.annealing import KL_SHARE, Z_LOGIT_CLIP, Sigmoid, cooldown, learning_rate
 
 
 def test_a_sigmoid_is_halfway_at_its_center_and_goes_from_start_to_end() -> None:
@@ -16,8 +16,8 @@ def test_a_sigmoid_is_halfway_at_its_center_and_goes_from_start_to_end() -> None
 
 
 def test_the_released_schedules() -> None:
-    assert KL_WEIGHT(400) == pytest.approx(50.0)
-    assert KL_WEIGHT(0) < 2
+    assert KL_SHARE(400) == pytest.approx(0.5)
+    assert KL_SHARE(0) < 0.02
     assert Z_LOGIT_CLIP(300) == pytest.approx(2.525)
     assert Z_LOGIT_CLIP(0) < 0.1
     assert Z_LOGIT_CLIP(3000) == pytest.approx(5.0)
@@ -27,3 +27,8 @@ def test_the_learning_rate_decays_to_a_floor() -> None:
     assert learning_rate(0.003, 0) == 0.003
     assert learning_rate(0.003, 1) == pytest.approx(0.003 * 0.9999)
     assert learning_rate(0.003, 10**6) == 1e-5
+
+
+def test_the_learning_rate_cools_down_at_the_end() -> None:
+    assert [cooldown(step, 10, 4) for step in (0, 6, 7, 9, 10, 11)] == [1, 1, 0.75, 0.25, 0, 0]
+    assert cooldown(10, 10, 0) == 1

@@ -1,12 +1,14 @@
 """The loop: learns, resumes exactly, keeps the best."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
-from model.cvae import CvaeNetworks
 from model.forecaster import Context
+from model.network_forecaster import Networks
+from model.networks.covernet import CoverNet
 from model.scene import AgentType
 from model.training.config import Method, TrainingConfig, TrainingError, load_config
 from model.training.loop import SCORE, Trainer
@@ -16,7 +18,7 @@ from tests.model.training.fakes import MadeUpPairs, small_config
 PAIRS = MadeUpPairs(48)
 
 
-def validate(networks: CvaeNetworks) -> dict[str, float]:
+def validate(networks: Networks[Any]) -> dict[str, float]:
     """FDE of the likeliest mode on the training pairs."""
     features, future = PAIRS.batch(torch.arange(len(PAIRS)))
     with torch.no_grad():
@@ -40,22 +42,71 @@ def train(config: TrainingConfig, folder: Path) -> tuple[Trainer, list[dict[str,
 @pytest.mark.parametrize("method", list(Method))
 def test_every_method_learns(tmp_path: Path, method: Method) -> None:
     _, reports = train(small_config(method, epochs=8), tmp_path)
-    likelihood = "log_likelihood" if "log_likelihood" in reports[0] else "log_likelihood_full"
-    assert reports[-1][likelihood] > reports[0][likelihood] + 5
+    first, last = reports[0], reports[-1]
+    if method is Method.COVERNET:
+        assert last["loss"] < first["loss"] - 0.5
+        assert last["top_5"] > first["top_5"]
+    else:
+        likelihood = "log_likelihood" if "log_likelihood" in first else "log_likelihood_full"
+        assert last[likelihood] > first[likelihood] + 5
     assert all(torch.isfinite(torch.tensor(list(figures.values()))).all() for figures in reports)
 
 
-def test_a_run_in_two_parts_is_the_same_as_in_one(tmp_path: Path) -> None:
-    whole, _ = train(small_config(epochs=4), tmp_path / "whole")
-    train(small_config(epochs=2), tmp_path / "parts")
-    parts, reports = train(small_config(epochs=4), tmp_path / "parts")
+@pytest.mark.parametrize("method", [Method.CAB, Method.COVERNET, Method.HALENTNET])
+def test_a_run_in_two_parts_is_the_same_as_in_one(tmp_path: Path, method: Method) -> None:
+    whole, _ = train(small_config(method, epochs=4), tmp_path / "whole")
+    train(small_config(method, epochs=2), tmp_path / "parts")
+    parts, reports = train(small_config(method, epochs=4), tmp_path / "parts")
     assert len(reports) == 2
     assert parts.progress.step == whole.progress.step
     assert parts.progress.best_score == whole.progress.best_score
-    for (name, a), (_, b) in zip(
-        whole.networks.state_dict().items(), parts.networks.state_dict().items(), strict=True
-    ):
-        assert torch.equal(a, b), name
+    for module, networks in whole.learner.modules().items():
+        other = parts.learner.modules()[module].state_dict()
+        for name, tensor in networks.state_dict().items():
+            assert torch.equal(tensor, other[name]), (module, name)
+
+
+def test_a_run_begins_with_the_parameters_that_it_is_given(tmp_path: Path) -> None:
+    first, _ = train(small_config(Method.TRAJECTRON, epochs=1), tmp_path / "first")
+    given = dict(first.networks.state_dict())
+    config = small_config(Method.CAB, epochs=1, start="trajectron@1.0.0 (causal)")
+    begun = Trainer(config, PAIRS, validate, tmp_path / "second", torch.device("cpu"), given)
+    assert all(torch.equal(t, given[name]) for name, t in begun.networks.state_dict().items())
+
+
+def test_a_start_that_does_not_fit_is_refused(tmp_path: Path) -> None:
+    given = {"vehicle.full.decoder.mean.bias": torch.zeros(2)}
+    with pytest.raises(TrainingError, match="fits 0% of the network's parameters"):
+        Trainer(small_config(), PAIRS, validate, tmp_path, torch.device("cpu"), given)
+
+
+def test_what_covernet_computes_from_the_data_stays_when_it_begins_with_another(tmp_path: Path) -> None:
+    first, _ = train(small_config(Method.COVERNET, epochs=1), tmp_path / "first")
+    given = {name: t + 1 for name, t in first.networks.state_dict().items()}
+    begun = Trainer(
+        small_config(Method.COVERNET), PAIRS, validate, tmp_path / "second", torch.device("cpu"), given
+    )
+    for name, tensor in first.networks.named_buffers():
+        assert torch.equal(begun.networks.get_buffer(name), tensor)
+
+
+def test_the_end_of_a_run_cools_and_its_length_is_then_fixed(tmp_path: Path) -> None:
+    _, reports = train(small_config(epochs=2, cooldown_epochs=1), tmp_path)
+    assert reports[0]["learning_rate"] == pytest.approx(0.003, rel=0.01)
+    assert reports[1]["learning_rate"] == 0
+    with pytest.raises(TrainingError, match="other settings: epochs"):
+        train(small_config(epochs=4, cooldown_epochs=1), tmp_path)
+
+
+def test_the_cover_of_covernet_is_of_the_training_paths(tmp_path: Path) -> None:
+    trainer, _ = train(small_config(Method.COVERNET, epochs=1), tmp_path)
+    network = trainer.networks.of(AgentType.VEHICLE)
+    assert isinstance(network, CoverNet)
+    assert network.config.members == len(network.cover) > network.config.modes
+    same = (PAIRS.paths[:, None] == network.cover).all(dim=(2, 3))
+    assert same.any(dim=0).all()
+    farthest = (PAIRS.paths[:, None] - network.cover).norm(dim=-1).amax(dim=-1)
+    assert farthest.amin(dim=1).amax() <= network.config.epsilon + 1e-4
 
 
 def test_the_best_epoch_is_kept(tmp_path: Path) -> None:
@@ -93,6 +144,14 @@ def test_every_method_has_its_settings(method: Method) -> None:
     assert load_config(method, learning_rate=0.0003).learning_rate == 0.0003
 
 
+@pytest.mark.parametrize("method", list(Method))
+def test_the_settings_on_a_card_are_a_settings_file(tmp_path: Path, method: Method) -> None:
+    config = load_config(method, epochs=7, kl_weight=2.5)
+    file = tmp_path / "settings.toml"
+    file.write_text(config.toml())
+    assert load_config(method, file) == config
+
+
 def test_wrong_settings_are_named(tmp_path: Path) -> None:
     file = tmp_path / "x.toml"
     file.write_text("learning_rate = -1\nnot_there = 3\n")
@@ -100,3 +159,9 @@ def test_wrong_settings_are_named(tmp_path: Path) -> None:
         load_config(Method.CAB, file)
     with pytest.raises(TrainingError, match="cannot be read"):
         load_config(Method.CAB, tmp_path / "nowhere.toml")
+    file.write_text('description = ""\nlearning_rate = 1\n[network]\nkind = "covernet"\n')
+    with pytest.raises(TrainingError, match="of kind covernet does not learn by cab"):
+        load_config(Method.CAB, file)
+    file.write_text('description = ""\nlearning_rate = 1\n[network]\nkind = "oracle"\n')
+    with pytest.raises(TrainingError, match="network: kind must be cvae or covernet"):
+        load_config(Method.CAB, file)

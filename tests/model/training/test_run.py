@@ -6,9 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from model.checkpoint import load_checkpoint
 from model.data.scenes import DataError
 from model.forecaster import Protocol
+from model.networks.config import CoverNetConfig
 from model.registry import Registry
+from model.scene import AgentType
 from model.training import run as run_module
 from model.training.config import Method, TrainingError
 from model.training.logs import RunLog
@@ -31,7 +34,6 @@ def go(run: Run) -> tuple[Path, list[Progress]]:
     """Runs it; where the checkpoint is, and each epoch's progress."""
     reports: list[Progress] = []
     folder = run.train(
-        "cab-forecast train cab",
         lambda progress, figures: reports.append(progress),
         lambda *_: None,
         lambda _: None,
@@ -51,8 +53,22 @@ def test_a_run_ends_in_a_checkpoint_that_the_registry_loads(run: Run) -> None:
     assert np.isfinite(info.benchmark["fde_ml_6s_m"])
     assert {"ade_f_6s_m", "off_road_ml", "inside_90", "nll"} <= info.benchmark.keys()
     card = (models / "cab/README.md").read_text()
-    for said in ("causal", "seed 0", "cab-forecast train cab", "non-commercial", "fde_ml_6s_m"):
+    command = "cab-forecast train cab --data made:DATA"
+    for said in ("causal", "seed 0", command, "standard deviations times", "non-commercial", "fde_ml_6s_m"):
         assert said in card
+    assert str(run.out) not in card
+
+
+def test_a_run_of_covernet_ends_in_a_checkpoint_with_its_cover(run: Run) -> None:
+    folder, _ = go(replace(run, config=small_config(Method.COVERNET, epochs=1)))
+    checkpoint = load_checkpoint(folder)
+    assert isinstance(checkpoint.network, CoverNetConfig)
+    assert checkpoint.network.members == len(checkpoint.tensors["vehicle.cover"]) > 5
+    assert checkpoint.info.modes == checkpoint.network.modes == 5
+    assert checkpoint.info.context_types == (AgentType.VEHICLE, AgentType.PEDESTRIAN)
+    assert np.isfinite(checkpoint.info.benchmark["nll"])
+    # A cache of its own, beside those of the other methods
+    assert [file.name for file in run.cache.iterdir()] == ["made-48168fa9-some-causal-5-vp-drawn"]
 
 
 def test_an_interrupted_run_goes_on(run: Run) -> None:

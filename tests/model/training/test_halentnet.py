@@ -1,0 +1,130 @@
+"""HalentNet's steps: who learns from what."""
+
+import math
+
+import pytest
+import torch
+
+from model.forecaster import Context
+from model.networks.config import NetworkConfig
+from model.networks.network import AgentNetwork
+from model.scene import AgentType
+from model.training.config import Method
+from model.training.halentnet import FIRST_SWITCH, LAST_SWITCH, STEPS, HalentLearner
+from model.training.learner import Batch
+from model.training.objectives import Weights
+from tests.model.training.fakes import MadeUpPairs, small_config
+
+PAIRS = MadeUpPairs(48)
+WEIGHTS = Weights(kl=1.0, logit_clip=5.0)
+
+
+def batch(start: int) -> Batch:
+    """Four of the pairs."""
+    return Batch(*PAIRS.batch(torch.arange(start, start + 4)))
+
+
+@pytest.fixture
+def learner() -> HalentLearner:
+    torch.manual_seed(0)
+    config = small_config(Method.HALENTNET, precision="float32", adversarial_batch_size=4)
+    return HalentLearner(config, torch.device("cpu"))
+
+
+def parameters(module: torch.nn.Module) -> dict[str, torch.Tensor]:
+    """Copies; what a forward alone changes (spectral norms) is not among them."""
+    return {name: parameter.detach().clone() for name, parameter in module.named_parameters()}
+
+
+def same(module: torch.nn.Module, before: dict[str, torch.Tensor]) -> bool:
+    """Whether nothing was learned since."""
+    return all(torch.equal(parameter, before[name]) for name, parameter in module.named_parameters())
+
+
+def test_one_step_teaches_both_networks_and_names_its_terms(learner: HalentLearner) -> None:
+    before = {name: parameters(module) for name, module in learner.modules().items()}
+    terms = learner.step([batch(0), batch(16), batch(32)], WEIGHTS, 0.01)
+    assert {"discriminator", "fool", "creative", "log_likelihood", "loss"} <= set(terms)
+    assert all(torch.isfinite(term) for term in terms.values())
+    assert not any(same(module, before[name]) for name, module in learner.modules().items())
+
+
+def test_each_adversarial_part_teaches_its_own_network(learner: HalentLearner) -> None:
+    generator, discriminator = parameters(learner.networks), parameters(learner.discriminator)
+    learner.learn_to_tell(batch(0), WEIGHTS)
+    assert same(learner.networks, generator)
+    assert not same(learner.discriminator, discriminator)
+    discriminator = parameters(learner.discriminator)
+    learner.learn_to_fool(batch(16), WEIGHTS, 0.01)
+    assert not same(learner.networks, generator)
+    assert same(learner.discriminator, discriminator)
+
+
+def test_the_discriminator_learns_to_tell(learner: HalentLearner) -> None:
+    told = [learner.learn_to_tell(batch(0), WEIGHTS)["discriminator"].item() for _ in range(6)]
+    assert told[-1] < 0.5 * told[0]
+
+
+def test_the_generator_learns_to_fool_and_leaves_the_discriminator_alone(learner: HalentLearner) -> None:
+    for _ in range(10):
+        learner.learn_to_tell(batch(0), WEIGHTS)
+    weights = {k: v.clone() for k, v in learner.discriminator.named_parameters()}
+    learner.discriminator.eval()  # no power iterations
+    fooled = []
+    for _ in range(8):
+        torch.manual_seed(1)  # the same samples and dropout each time
+        fooled.append(learner.learn_to_fool(batch(0), WEIGHTS, 0.003)["fool"].item())
+    assert min(fooled[1:]) < 0.9 * fooled[0], fooled
+    assert all(torch.equal(v, weights[k]) for k, v in learner.discriminator.named_parameters())
+    assert all(v.requires_grad for v in learner.discriminator.parameters())
+
+
+def test_the_map_encoder_has_a_rate_of_its_own(learner: HalentLearner) -> None:
+    learner.step([batch(0), batch(16), batch(32)], WEIGHTS, 0.002)
+    encoder = learner.network.map_encoder
+    assert encoder is not None
+    slow = next(group for group in learner.optimizer.param_groups if "rate_factor" in group)
+    assert slow["lr"] == pytest.approx(0.0008)
+    assert {id(p) for p in slow["params"]} == {id(p) for p in encoder.parameters()}
+
+
+def test_a_hallucination_changes_its_category_once_on_the_way(learner: HalentLearner) -> None:
+    latents = torch.randint(0, 5, (500,))
+    switched = learner.switched(latents)
+    assert switched.shape == (500, STEPS)
+    assert torch.equal(switched[:, FIRST_SWITCH - 1], latents)
+    assert (switched[:, LAST_SWITCH] != latents).all()
+    changes = (switched[:, 1:] != switched[:, :-1]).int()
+    assert (changes.sum(dim=1) == 1).all()
+    assert set((changes.argmax(dim=1) + 1).tolist()) == set(range(FIRST_SWITCH, LAST_SWITCH + 1))
+
+
+def test_a_sample_of_one_category_is_that_mode_when_there_is_no_noise() -> None:
+    torch.manual_seed(0)
+    network = AgentNetwork(NetworkConfig(modes=5), AgentType.VEHICLE).eval()
+    with torch.no_grad():
+        network.full.decoder.log_sigma.weight.zero_()
+        network.full.decoder.log_sigma.bias.fill_(-30.0)
+        features = batch(0).features
+        encoding = network.encode(features, Context.FULL)
+        modes = network.decode(encoding, features, Context.FULL, STEPS).mean
+        for z in range(5):
+            path = network.sample(encoding, features, torch.full((4, STEPS), z))
+            assert torch.allclose(path, modes[:, z], atol=1e-4)
+
+
+def test_in_bfloat16_the_sample_stays_near() -> None:
+    torch.manual_seed(0)
+    network = AgentNetwork(NetworkConfig(modes=5), AgentType.VEHICLE)
+    decoder = network.full.decoder
+    features = batch(0).features
+    with torch.no_grad():
+        encoding = network.encode(features, Context.FULL)
+        exact = decoder(encoding, features["history"][:, -1], STEPS).mean_1
+        decoder.training_dtype = torch.bfloat16
+        near = decoder(encoding, features["history"][:, -1], STEPS).mean_1
+        assert near.dtype == torch.float32
+        assert not torch.equal(near, exact)
+        assert math.isclose((near - exact).abs().max().item(), 0.0, abs_tol=0.02)
+        decoder.eval()  # low precision is for training alone
+        assert torch.equal(decoder(encoding, features["history"][:, -1], STEPS).mean_1, exact)
