@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli import convert, predict, serve, train
+from service.cli import convert, evaluate, predict, serve, train
 
 app = typer.Typer(
     name="cab-forecast",
@@ -34,3 +34,4 @@ serve.register(app)
 predict.register(app)
 convert.register(app)
 train.register(app)
+evaluate.register(app)

@@ -1,7 +1,6 @@
 """A training run on the terminal: a bar within the epoch, a line after each."""
 
-import shlex
-import sys
+import os
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -18,7 +17,8 @@ def show_training(run: Run) -> None:
         TrainingError: the run cannot be resumed.
         DataError: the data is bad.
     """
-    console = Console()
+    # Under torchrun, one process speaks for all
+    console = Console(quiet=os.environ.get("RANK", "0") != "0")
     bar = Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -41,5 +41,5 @@ def show_training(run: Run) -> None:
                 f"{figures['seconds']:.0f} s ({best})"
             )
 
-        folder = run.train(shlex.join(["cab-forecast", *sys.argv[1:]]), report, tick, console.print)
+        folder = run.train(report, tick, console.print)
     console.print(f"checkpoint: {folder}")

@@ -1,0 +1,1 @@
+"""Judges whole models on recorded data, without a server."""

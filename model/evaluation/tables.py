@@ -1,0 +1,145 @@
+"""Results as tables of text."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from model.evaluation.ablation import Without
+from model.evaluation.published import PUBLISHED
+from model.evaluation.results import Results, Row
+from model.metrics.displacement import HORIZONS_S
+
+NOTHING = "-"
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns of text; the first is the model."""
+
+    title: str
+    note: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+def tables(results: Results) -> list[Table]:
+    """The likeliest trajectory, the whole forecast, the paper's figures beside ours where there are any,
+    and, where it was asked for, what the context is worth."""
+    made = [_most_likely(results), _whole(results)]
+    if any(row.name in PUBLISHED for row in results.rows):
+        made.append(_beside_the_paper(results))
+    if results.ablate:
+        made.append(_context(results))
+    return made
+
+
+def markdown(results: Results) -> str:
+    """All tables, each with what it is of."""
+    parts = [f"# Evaluation: {results.statement()}"]
+    for table in tables(results):
+        parts.append(f"## {table.title}\n\n{table.note}")
+        lines = [table.columns, ("---", *("--:" for _ in table.columns[1:])), *table.rows]
+        parts.append("\n".join(f"| {' | '.join(line)} |" for line in lines))
+    return "\n\n".join(parts) + "\n"
+
+
+def _most_likely(results: Results) -> Table:
+    columns = {f"ADE {second} s": f"ade_ml_{second}s_m" for second in HORIZONS_S}
+    columns |= {f"FDE {second} s": f"fde_ml_{second}s_m" for second in HORIZONS_S}
+    columns["OffR"] = "off_road_ml"
+    note = f"{results.statement()}. ADE-ML and FDE-ML in m; OffR-ML: share that leaves the driveable area."
+    return _plain("The most likely trajectory", note, columns, results.rows)
+
+
+def _whole(results: Results) -> Table:
+    columns = {
+        "ADE-f": "ade_f_6s_m",
+        "FDE-f": "fde_f_6s_m",
+        "OffR-f": "off_road_f",
+        "NLL": "nll",
+        "minADE_5": "min_ade_5_m",
+        "minADE_10": "min_ade_10_m",
+        "miss rate 5": "miss_rate_5",
+        "miss rate 10": "miss_rate_10",
+        "inside 50 %": "inside_50",
+        "inside 90 %": "inside_90",
+        "inside 99 %": "inside_99",
+    }
+    note = (
+        f"{results.statement()}. At 6 s, in m; f: mean over the sampled trajectories; NLL: nats a step; "
+        "miss: every one of the k modes is 2 m off somewhere; inside p %: share of the steps at which the "
+        "truth is in the region that is said to hold p %."
+    )
+    return _plain("The whole forecast", note, columns, results.rows)
+
+
+def _beside_the_paper(results: Results) -> Table:
+    figures = {
+        "ADE": "ade_ml_6s_m",
+        "FDE": "fde_ml_6s_m",
+        "OffR": "off_road_ml",
+        "ADE-f": "ade_f_6s_m",
+        "FDE-f": "fde_f_6s_m",
+        "OffR-f": "off_road_f",
+    }
+    columns = ["model", *(f"{name}{whose}" for name in figures for whose in ("", " (paper)"))]
+    rows = []
+    for row in results.rows:
+        if row.name in PUBLISHED:
+            theirs = PUBLISHED[row.name].figures()
+            pairs = ((_number(row.metrics, name), _number(theirs, name)) for name in figures.values())
+            rows.append((_label(row, results.rows), *(cell for pair in pairs for cell in pair)))
+    note = (
+        f"Ours: {results.statement()}. (paper): Ben-Younes et al. 2022, table 1: paper protocol, its own "
+        "split, 2000 sampled trajectories. At 6 s, in m; the most likely trajectory, and f: samples."
+    )
+    return Table("Beside the paper's figures", note, tuple(columns), tuple(rows))
+
+
+def _context(results: Results) -> Table:
+    names = {Without.MAP: "no map", Without.NEIGHBORS: "no neighbours", Without.BOTH: "neither"}
+    figures = {"ADE": "ade_ml_6s_m", "FDE": "fde_ml_6s_m"}
+    columns = ["model"]
+    for figure in figures:
+        columns += [figure, *(f"{figure}, {name}" for name in names.values())]
+    rows = []
+    for row in results.rows:
+        if row.learned:
+            cells = [_label(row, results.rows)]
+            for figure in figures.values():
+                cells.append(_number(row.metrics, figure))
+                cells += [_loss(row, without, figure) for without in names]
+            rows.append(tuple(cells))
+    note = (
+        f"{results.statement()}. ADE-ML and FDE-ML at 6 s in m with everything, then how much greater they "
+        "are with the map unknown, without neighbours, and without both."
+    )
+    return Table("Does the context matter?", note, tuple(columns), tuple(rows))
+
+
+def _plain(title: str, note: str, columns: Mapping[str, str], rows: Sequence[Row]) -> Table:
+    """A column a metric."""
+    cells = tuple(
+        (_label(row, rows), *(_number(row.metrics, metric) for metric in columns.values())) for row in rows
+    )
+    return Table(title, note, ("model", *columns), cells)
+
+
+def _label(row: Row, rows: Sequence[Row]) -> str:
+    """The name, with the version where another row has that name, too."""
+    twice = sum(other.name == row.name for other in rows) > 1
+    return f"{row.name}@{row.version}" if twice else row.name
+
+
+def _number(figures: Mapping[str, float], name: str) -> str:
+    value = figures.get(name, math.nan)
+    return NOTHING if math.isnan(value) else f"{value:.2f}"
+
+
+def _loss(row: Row, without: Without, figure: str) -> str:
+    """How much greater a figure is without something: "+0.31 (+4 %)"."""
+    if without not in row.ablated:
+        return NOTHING
+    whole, less = row.metrics[figure], row.ablated[without][figure]
+    percent = f" ({100 * (less - whole) / whole:+.1f} %)" if whole else ""
+    return f"{less - whole:+.2f}{percent}"

@@ -1,0 +1,98 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from model.data.protocols import frame_scene
+from model.evaluation.ablation import Without
+from model.evaluation.learned import Judged, judge_learned, open_validations
+from model.evaluation.subjects import Learned, choose
+from model.forecaster import Protocol
+from model.metrics.evaluate import instance_metrics
+from model.training import validation
+from tests.model.data.records import FixedReader, record
+from tests.model.evaluation.builders import checkpoints, save_covernet
+
+READER = FixedReader(record(), record("scene-2", seed=1))
+
+
+def judge(folder: Path, models: tuple[Learned, ...], **options: bool | int) -> dict[str, Judged]:
+    """On one cache for all of them."""
+    said: list[str] = []
+    ((found, group),) = open_validations(models, folder, READER, "made", "some", Protocol.CAUSAL, said.append)
+    assert group == list(models)
+    values = {"ablate": False, "samples": 0, "draws": 0} | options
+    return judge_learned(found, models, **values)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def models(tmp_path: Path) -> tuple[Learned, ...]:
+    """cab and trajectron-no-context of random weights."""
+    return choose(checkpoints(tmp_path / "models"), Protocol.CAUSAL).learned
+
+
+def test_figures_are_those_of_forecasts_from_the_scene(tmp_path: Path, models: tuple[Learned, ...]) -> None:
+    """A cache's features and patches are those that a server makes of the scene."""
+    judged = judge(tmp_path, models, samples=8, draws=9)
+    for model in models:
+        fde: list[float] = []
+        off_road: list[float] = []
+        for one in READER.scenes("some"):
+            for pair in one.pairs:
+                scene, tracks = frame_scene(one, pair.frame, Protocol.CAUSAL, 5)
+                now = int(np.searchsorted(one.tracks[pair.track].frames, pair.frame))
+                truth = one.tracks[pair.track].position[None, now + 1 : now + 13]
+                forecast = model.forecaster(scene, np.flatnonzero(tracks == pair.track))
+                seeds = [len(fde)]
+                metrics = instance_metrics(forecast, truth, [one.raster], seeds, samples=8, draws=0)
+                fde += metrics["fde_f_6s_m"].tolist()
+                off_road += metrics["off_road_ml"].tolist()
+        found = judged[f"{model.info.name}@1.0.0"].metrics
+        assert found.mean("fde_f_6s_m") == pytest.approx(np.mean(fde), rel=1e-3)
+        assert found.mean("off_road_ml") == pytest.approx(np.mean(off_road), abs=0.02)
+        assert found.count("inside_90") == len(fde)
+
+
+def test_batches_make_no_difference(
+    tmp_path: Path, models: tuple[Learned, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = judge(tmp_path, models, samples=8, draws=9)
+    monkeypatch.setattr(validation, "BATCH", 7)
+    cut = judge(tmp_path, models, samples=8, draws=9)
+    for name, one in whole.items():
+        for metric, value in one.metrics.means().items():
+            assert cut[name].metrics.mean(metric) == pytest.approx(value, rel=1e-4, abs=1e-4), metric
+
+
+def test_ablation_judges_what_a_model_looks_at(tmp_path: Path, models: tuple[Learned, ...]) -> None:
+    judged = judge(tmp_path, models, ablate=True, limit=20)
+    cab, alone = judged["cab@1.0.0"], judged["trajectron-no-context@1.0.0"]
+    assert set(cab.ablated) == set(Without)
+    assert not alone.ablated
+    errors = {one.mean("ade_ml_6s_m") for one in (cab.metrics, *cab.ablated.values())}
+    assert len(errors) == 4  # each of them matters to random weights
+    assert all(one.count("ade_ml_6s_m") == 20 for one in (cab.metrics, alone.metrics, *cab.ablated.values()))
+
+
+def test_covernet_has_a_cache_of_its_own(tmp_path: Path) -> None:
+    save_covernet(checkpoints(tmp_path / "models") / "covernet")
+    models = choose(tmp_path / "models", Protocol.CAUSAL).learned
+    said: list[str] = []
+    opened = list(open_validations(models, tmp_path, READER, "made", "some", Protocol.CAUSAL, said.append))
+    assert [[one.info.name for one in group] for _, group in opened] == [
+        ["cab", "trajectron-no-context"],
+        ["covernet"],
+    ]
+    (found, group) = opened[1]
+    judged = judge_learned(found, group, ablate=True, samples=0, draws=0)["covernet@1.0.0"]
+    assert set(judged.ablated) == set(Without)
+    nll = {one.mean("nll") for one in (judged.metrics, *judged.ablated.values())}
+    assert len(nll) == 4  # the boxes, too, are taken away
+
+
+def test_caches_are_made_once(tmp_path: Path, models: tuple[Learned, ...]) -> None:
+    said: list[str] = []
+    for _ in range(2):
+        list(open_validations(models, tmp_path, READER, "made", "some", Protocol.CAUSAL, said.append))
+    assert len(said) == 1
+    assert "made-48168fa9-some-causal-5-vp" in said[0]
