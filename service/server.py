@@ -155,4 +155,13 @@ def _load_models(settings: Settings) -> Registry:
     _log.info(
         "models loaded", folder=str(folder) if folder else None, models=[i.name for i in registry.infos()]
     )
+    if registry.passed_over:
+        # Somebody's own folder may be meant to be served whole; the bundled one is not
+        log = _log.info if settings.models is None else _log.warning
+        log(
+            "models passed over: they are of the paper protocol",
+            folder=str(folder),
+            models=[f"{info.name}@{info.version}" for info in registry.passed_over],
+            load_with="--allow-paper-protocol or FORECAST_ALLOW_PAPER_PROTOCOL=true",
+        )
     return registry

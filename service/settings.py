@@ -42,7 +42,8 @@ class Settings(BaseSettings):
     default_model: str | None = None
     """The model of requests that name none; None: "cab" if loaded, else "kalman"."""
     allow_paper_protocol: bool = False
-    """Load models trained by the paper protocol, too; they warn in every answer."""
+    """Load models trained by the paper protocol, too; they warn in every answer. Otherwise they are passed
+    over, and a folder that holds no others is refused."""
     api_tokens: Annotated[tuple[SecretStr, ...], NoDecode] = ()
     """Bearer tokens that are let in; not set: everyone is. Comma-separated in the environment."""
 

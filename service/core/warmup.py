@@ -18,8 +18,11 @@ _SPEED = 5.0
 
 
 async def warm_up(batcher: Batcher, catalog: Catalog, max_batch_agents: int) -> None:
-    """Runs every model once for each agent type, alone and in the largest batch; the default model and
-    the fallback in the sizes between as well, by powers of two.
+    """Runs every model once for each agent type, alone; the default model and the fallback also in larger
+    batches, by powers of two up to the largest.
+
+    A server starts with many models and is mostly asked for one: the others' large batches would keep it
+    from being ready for seconds.
 
     Args:
         batcher: whose model thread does the work.
@@ -31,7 +34,7 @@ async def warm_up(batcher: Batcher, catalog: Catalog, max_batch_agents: int) -> 
     for info in catalog.models.infos():
         forecaster = catalog.get(f"{info.name}@{info.version}")
         main = forecaster is catalog.default or forecaster is catalog.fallback
-        sizes = _sizes(max_batch_agents) if main else sorted({1, max_batch_agents})
+        sizes = _sizes(max_batch_agents) if main else [1]
         for kind in info.agent_types:
             for context in (Context.FULL, Context.BLIND) if info.supports_blind else (Context.FULL,):
                 for job in await batcher.call_in_model_thread(_jobs, forecaster, kind, context, sizes):

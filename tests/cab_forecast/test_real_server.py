@@ -27,11 +27,12 @@ MODEL = "constant-velocity-yaw"
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[Server]:
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     """The server with its baselines, in a loop and thread of its own: blocking clients call it."""
     settings = Settings(
         http="127.0.0.1:0",
         grpc="127.0.0.1:0",
+        models=tmp_path_factory.mktemp("models"),
         default_model=MODEL,
         max_batch_agents=32,
         api_tokens=(SecretStr(TOKEN),),

@@ -3,6 +3,7 @@
 import asyncio
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -18,13 +19,26 @@ import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from structlog.testing import capture_logs
 
-from cab_forecast import Client
+from cab.forecast.v1 import model_service_pb2 as models_pb
+from cab_forecast import AsyncClient, Client
+from model.checkpoint import save_checkpoint
+from model.forecaster import Protocol
 from model.registry import Registry
 from service.server import Server, StartError
 from service.settings import Settings
+from tests.model.checkpoints import info, network, tensors
 from tests.service.fakes import FakeForecaster, registry
 from tests.service.requests import make_request
-from tests.service.servers import PREDICT, CallError, call_grpc, call_rest, running, settings, until_waiting
+from tests.service.servers import (
+    PREDICT,
+    TRANSPORTS,
+    CallError,
+    call_grpc,
+    call_rest,
+    running,
+    settings,
+    until_waiting,
+)
 
 
 @contextmanager
@@ -300,6 +314,67 @@ async def test_models_are_the_baselines_when_none_are_bundled(monkeypatch: pytes
     assert "kalman" in server_models
 
 
+def as_bundled(folder: Path) -> None:
+    """Checkpoints of random weights, as they come with the package: one name under both protocols."""
+    for version, protocol in (("1.0.0", Protocol.CAUSAL), ("1.0.0+paper", Protocol.PAPER)):
+        known = info(name="cab", version=version, protocol=protocol)
+        save_checkpoint(folder / version, known, network(), tensors(), "")
+
+
+async def test_the_bundled_cab_is_the_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    as_bundled(tmp_path)
+    monkeypatch.setattr("service.server.bundled_models", lambda: tmp_path)
+    server = Server(settings(max_batch_agents=8))
+    with capture_logs() as logs:
+        await server.start()
+    try:
+        (told,) = (entry for entry in logs if "passed over" in entry["event"])
+        assert (told["log_level"], told["models"]) == ("info", ["cab@1.0.0+paper"])
+        assert "--allow-paper-protocol" in told["load_with"]
+        answer = await call_grpc(server, make_request(1))
+        assert (answer.model.name, answer.model.version) == ("cab", "1.0.0")
+        with pytest.raises(CallError, match=r"so cab@1\.0\.0\+paper was not loaded") as caught:
+            await call_rest(server, make_request(1, model="cab@1.0.0+paper"))
+        assert caught.value.code == "NOT_FOUND"
+    finally:
+        await server.stop()
+
+
+async def test_both_protocols_of_a_name_are_served_once_allowed(tmp_path: Path) -> None:
+    as_bundled(tmp_path)
+    server = Server(settings(models=tmp_path, allow_paper_protocol=True, max_batch_agents=8))
+    await server.start()
+    try:
+        async with AsyncClient(f"http://{server.http_address}") as client:
+            found = [model for model in await client.list_models() if model.name == "cab"]
+            assert [(model.version, model.protocol, model.is_default) for model in found] == [
+                ("1.0.0", models_pb.INPUT_PROTOCOL_CAUSAL, True),
+                ("1.0.0+paper", models_pb.INPUT_PROTOCOL_PAPER, False),
+            ]
+            assert await client.get_model("cab@1.0.0+paper") == found[1]
+        for name, version in (("", "1.0.0"), ("cab", "1.0.0"), ("cab@1.0.0+paper", "1.0.0+paper")):
+            for call in TRANSPORTS.values():
+                answer = await call(server, make_request(1, model=name))
+                assert answer.model.version == version
+                paper = version == "1.0.0+paper"
+                assert (answer.model.protocol == models_pb.INPUT_PROTOCOL_PAPER) is paper
+                assert any("paper protocol" in warning for warning in answer.warnings) is paper
+    finally:
+        await server.stop()
+
+
+async def test_a_folder_of_ones_own_warns_and_one_of_the_paper_protocol_alone_is_refused(
+    tmp_path: Path,
+) -> None:
+    as_bundled(tmp_path)
+    with capture_logs() as logs:
+        assert Server(settings(models=tmp_path))._load().get("cab").info.version == "1.0.0"
+    assert [entry["log_level"] for entry in logs if "passed over" in entry["event"]] == ["warning"]
+    shutil.rmtree(tmp_path / "1.0.0")
+    with pytest.raises(StartError, match=r"paper protocol, and there is no other .*--allow-paper-protocol"):
+        await Server(settings(models=tmp_path)).start()
+
+
 @contextmanager
 def process(*arguments: str) -> Iterator["subprocess.Popen[str]"]:
     command = [sys.executable, "-m", "service", "serve", "--http", "127.0.0.1:0", "--grpc", "127.0.0.1:0"]
@@ -324,8 +399,8 @@ def ready(started: "subprocess.Popen[str]") -> tuple[str, str]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_drains(number: signal.Signals) -> None:
-    with process("--log-json") as started:
+def test_a_signal_drains(number: signal.Signals, tmp_path: Path) -> None:
+    with process("--log-json", "--models", str(tmp_path)) as started:  # an empty folder: the baselines
         _, address = ready(started)
         request = make_request(500, samples=200).SerializeToString()
         with grpc.insecure_channel(address, options=[("grpc.max_receive_message_length", -1)]) as channel:

@@ -404,14 +404,14 @@ async def test_fallback_must_reach_as_far() -> None:
             pass
 
 
-async def test_warm_up_meets_every_shape() -> None:
+async def test_warm_up_meets_every_shape_of_the_default_model() -> None:
     fake, other = FakeForecaster(), FakeForecaster("other", supports_blind=False)
     plane = DataPlane(settings(default_model="fake", max_batch_agents=6), Metrics())
     await plane.open(lambda: registry(fake, other))
     await plane.close()
     sizes = [agents for kind, agents, context, _ in fake.batches if context is Context.BLIND]
     assert sizes == [1, 2, 4, 6] * 2  # vehicles and pedestrians
-    assert [agents for _, agents, _, _ in other.batches] == [1, 6] * 2
+    assert [agents for _, agents, _, _ in other.batches] == [1] * 2
 
 
 def slow(seconds: float) -> Encoded:
