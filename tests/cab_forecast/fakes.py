@@ -33,6 +33,8 @@ from cab.forecast.v1.prediction_service_pb2_grpc import (
 from tests.cab_forecast.answers import answer
 
 PROTOBUF, JSON = "application/x-protobuf", "application/json"
+HELD = 30.0
+"""s, the longest that an answer is held back."""
 MODELS = [Model(name="fan", version="1.0.0", is_default=True), Model(name="kalman", version="2.0.0")]
 
 Answer = TypeVar("Answer", bound=Message)
@@ -93,8 +95,8 @@ class Script:
     """What the fake does: fails as told, call by call, then answers."""
 
     failures: list[Failure | Raw] = field(default_factory=list)
-    delay: float = 0.0
-    """s before every answer."""
+    held: threading.Event | None = None
+    """Answers wait for this to be set, ``HELD`` at most."""
     calls: list[Mapping[str, str]] = field(default_factory=list)
     """Headers of each call; "timeout" is what was left of the call's time, s."""
     times: list[float] = field(default_factory=list)
@@ -105,8 +107,8 @@ class Script:
         """One call: records it, and raises what the script says."""
         self.calls.append(headers)
         self.times.append(time.monotonic())
-        if self.delay:
-            time.sleep(self.delay)
+        if self.held is not None:
+            self.held.wait(HELD)
         if self.failures:
             raise self.failures.pop(0)
 
