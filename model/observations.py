@@ -1,8 +1,8 @@
 """Observations of agents as they come in: any rate, any length, with or without derivatives."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
-from model.arrays import Floats, Ints
+from model.arrays import Bools, Floats, Ints
 
 
 @dataclass(frozen=True)
@@ -27,3 +27,7 @@ class Observations:
     """[N, S, 2], m/s², ground frame."""
     heading_rate: Floats
     """[N, S], rad/s."""
+
+    def select(self, agents: Bools | Ints) -> "Observations":
+        """Some of the agents, by mask [N] or indices [n]."""
+        return Observations(**{field.name: getattr(self, field.name)[agents] for field in fields(self)})

@@ -19,7 +19,7 @@ from model.forecaster import Protocol
 from model.geometry import wrap_angle
 from model.observations import Observations
 from model.resample import resample
-from model.scene import STEP_SECONDS, Scene
+from model.scene import STEP_SECONDS, AgentStates, Scene
 
 _OLDER_FRAMES = 4
 """Frames before the history that its states can depend on: two of differences, and the one or two that a
@@ -59,6 +59,24 @@ class SceneFrames:
         sends none that it has lost; nor is one whose velocity is not known (a first sight, causal), as the
         server refuses it.
         """
+        observations, seen = self._observed(frame)
+        states = self._resampled(observations, frame)
+        known = states.velocity_known
+        seen = seen[known]
+        types = [self._record.tracks[track].type for track in seen.tolist()]
+        return Scene(types, states.select(known), self._record.raster), seen
+
+    def observations(self, frame: int) -> tuple[Observations, Ints]:
+        """What a client would send of the agents that ``at`` shows, and the index of each one's track [N]."""
+        observations, seen = self._observed(frame)
+        known = self._resampled(observations, frame).velocity_known
+        return observations.select(known), seen[known]
+
+    def _resampled(self, observations: Observations, frame: int) -> AgentStates:
+        return resample(observations, frame * STEP_SECONDS, self._history_frames)
+
+    def _observed(self, frame: int) -> tuple[Observations, Ints]:
+        """Observations of all that are annotated at a frame, and the index of each one's track [N]."""
         table = self._table
         window = self._history_frames + _OLDER_FRAMES
         now = frame - table.first_frame
@@ -92,11 +110,7 @@ class SceneFrames:
             acceleration=unknown if derived is None else pick(derived.acceleration, np.nan),
             heading_rate=unknown[..., 0] if derived is None else pick(derived.heading_rate, np.nan),
         )
-        states = resample(observations, frame * STEP_SECONDS, self._history_frames)
-        known = states.velocity_known
-        seen = seen[known]
-        types = [self._record.tracks[track].type for track in seen.tolist()]
-        return Scene(types, states.select(known), self._record.raster), seen
+        return observations, seen
 
 
 @dataclass(frozen=True)

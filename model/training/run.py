@@ -13,8 +13,8 @@ from model.cvae import CvaeNetworks
 from model.data.batches import Batches
 from model.data.cache import Cache
 from model.data.caches import open_cache
-from model.data.nuscenes_pred import NuscenesPredReader
 from model.data.scenes import Reader
+from model.data.sources import READERS
 from model.forecaster import ModelInfo, Protocol
 from model.scene import AgentType
 from model.training import processes
@@ -26,18 +26,6 @@ from model.training.loop import Report, Trainer
 from model.training.state import Progress
 from model.training.validation import Validation
 
-
-def _official(path: Path) -> Reader:
-    from model.data.nuscenes import NuscenesReader  # noqa: PLC0415 (an extra, with numpy < 2)
-
-    try:
-        return NuscenesReader(path)
-    except ImportError as error:
-        raise TrainingError(f"official nuScenes data needs the extra benchmark: {error}") from error
-
-
-READERS: dict[str, Callable[[Path], Reader]] = {"nuscenes_pred": NuscenesPredReader, "nuscenes": _official}
-"""Readers of data sets by the KIND of KIND:PATH."""
 
 SAMPLES = 200
 """Trajectories a pair for the sampled figures of a card."""
@@ -62,30 +50,6 @@ class Source:
             DataError: it is not there.
         """
         return READERS[self.kind](self.path)
-
-
-def parse_data(text: str) -> tuple[str, Path]:
-    """KIND and PATH of KIND:PATH.
-
-    Raises:
-        TrainingError: it is no such thing, or the kind is unknown.
-    """
-    kind, colon, path = text.partition(":")
-    if not colon or not path or kind not in READERS:
-        raise TrainingError(f"data: {text!r} is not KIND:PATH with KIND one of {', '.join(READERS)}")
-    return kind, Path(path)
-
-
-def parse_protocol(name: str) -> Protocol:
-    """A protocol by its name.
-
-    Raises:
-        TrainingError: there is none of that name.
-    """
-    try:
-        return Protocol(name)
-    except ValueError:
-        raise TrainingError(f"there is no protocol {name!r}; there are {', '.join(Protocol)}") from None
 
 
 @dataclass(frozen=True)

@@ -41,10 +41,9 @@ def evaluate(
     """Judges checkpoints beside physics and Kalman on every challenge pair of a split, without a server."""
     from model.checkpoint import CheckpointError  # noqa: PLC0415 (torch is slow to import)
     from model.data.scenes import DataError  # noqa: PLC0415
+    from model.data.sources import READERS, parse_data, parse_protocol  # noqa: PLC0415
     from model.evaluation.run import Evaluation, write_results  # noqa: PLC0415
     from model.evaluation.subjects import EvaluationError, choose  # noqa: PLC0415
-    from model.training.config import TrainingError  # noqa: PLC0415
-    from model.training.run import READERS, parse_data, parse_protocol  # noqa: PLC0415
     from service.cli.evaluation import show_evaluation, show_tables  # noqa: PLC0415
     from service.settings import bundled_models  # noqa: PLC0415
 
@@ -61,6 +60,6 @@ def evaluate(
         )
         results = show_evaluation(evaluation)
         write_results(results, out)
-    except (TrainingError, DataError, CheckpointError, EvaluationError, OSError) as error:
+    except (DataError, CheckpointError, EvaluationError, OSError) as error:
         fail(str(error))
     show_tables(results, out)

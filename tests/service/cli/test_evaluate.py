@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from model.training import run as run_module
+from model.data.sources import READERS
 from service.cli.main import app
 from tests.model.data.records import FixedReader, record
 from tests.model.evaluation.builders import PAPER_VERSION, checkpoints, save
@@ -17,7 +17,7 @@ PAIRS = len(record().pairs)
 @pytest.fixture(autouse=True)
 def made(monkeypatch: pytest.MonkeyPatch) -> None:
     """Data of the kind "made", with the split "some"."""
-    monkeypatch.setitem(run_module.READERS, "made", lambda path: FixedReader(record()))
+    monkeypatch.setitem(READERS, "made", lambda path: FixedReader(record()))
 
 
 def evaluate(

@@ -1,0 +1,145 @@
+"""Answers on disk, in one SQLite file: what has been asked is never asked again.
+
+Each answer is committed as it comes, so that a run that was killed has all it got; metrics are always of what
+is here, so that a resumed run, and one that only reads, find the same.
+"""
+
+import sqlite3
+from collections.abc import Iterator, Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from benchmark import BenchmarkError
+from benchmark.plan import Call
+from cab.forecast.v1.model_service_pb2 import Model
+from cab.forecast.v1.prediction_service_pb2 import PredictResponse
+
+FILE = "answers.sqlite"
+"""In a run's folder."""
+
+_TABLES = """
+CREATE TABLE IF NOT EXISTS run (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS models (key TEXT PRIMARY KEY, model BLOB NOT NULL) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS answers (
+    model TEXT NOT NULL, scene TEXT NOT NULL, frame INTEGER NOT NULL, challenge INTEGER NOT NULL,
+    seconds REAL NOT NULL, response BLOB NOT NULL,
+    PRIMARY KEY (model, scene, frame, challenge)
+);
+"""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What the endpoint said to one call."""
+
+    seconds: float
+    """That the client waited."""
+    response: PredictResponse
+
+
+class Archive:
+    """The answers of one run.
+
+    Args:
+        folder: of the run; made where it does not exist.
+        read_only: whether there must be answers already.
+
+    Raises:
+        BenchmarkError: it cannot be opened, or there is nothing to read.
+    """
+
+    def __init__(self, folder: Path, read_only: bool = False) -> None:
+        file = folder / FILE
+        if read_only and not file.is_file():
+            raise BenchmarkError(f"{file}: there are no saved answers")
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._file = sqlite3.connect(file, isolation_level=None)
+            # A commit then waits for no disk: a killed process loses nothing, a power cut the last answers
+            self._file.execute("PRAGMA journal_mode = WAL")
+            self._file.execute("PRAGMA synchronous = NORMAL")
+            self._file.executescript(_TABLES)
+        except (OSError, sqlite3.Error) as error:
+            raise BenchmarkError(f"{file}: cannot be used for answers: {error}") from error
+        self._path = file
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ends its use."""
+        self._file.close()
+
+    def bind(self, facts: Mapping[str, str]) -> None:
+        """Ties the archive to what is asked.
+
+        Raises:
+            BenchmarkError: it holds answers to something else; names what differs.
+        """
+        known = self.facts()
+        for name, value in facts.items():
+            if known.get(name, value) != value:
+                raise BenchmarkError(
+                    f"{self._path}: holds answers of another run: {name} was {known[name]!r}, is {value!r}; "
+                    "give another folder"
+                )
+        self._file.executemany("INSERT OR REPLACE INTO run VALUES (?, ?)", facts.items())
+
+    def facts(self) -> dict[str, str]:
+        """What it is tied to."""
+        return dict(self._file.execute("SELECT key, value FROM run"))
+
+    def register(self, key: str, model: Model) -> None:
+        """Notes a model whose answers will come.
+
+        Raises:
+            BenchmarkError: answers of another model under that name are here.
+        """
+        known = self.models().get(key)
+        if known is not None and not _same(known, model):
+            raise BenchmarkError(
+                f"{self._path}: {key} of the endpoint is not the one whose answers are here; give another folder"
+            )
+        self._file.execute("INSERT OR REPLACE INTO models VALUES (?, ?)", (key, model.SerializeToString()))
+
+    def models(self) -> dict[str, Model]:
+        """Models that have been asked, by ``name@version``, in the order of their names."""
+        rows = self._file.execute("SELECT key, model FROM models ORDER BY key")
+        return {key: Model.FromString(model) for key, model in rows}
+
+    def answered(self) -> set[tuple[str, str, int, bool]]:
+        """Model, scene, frame and kind of every call that has its answer."""
+        rows = self._file.execute("SELECT model, scene, frame, challenge FROM answers")
+        return {(model, scene, frame, bool(challenge)) for model, scene, frame, challenge in rows}
+
+    def add(self, model: str, scene: str, call: Call, answer: Answer) -> None:
+        """Keeps an answer."""
+        row = (model, scene, call.frame, call.challenge, answer.seconds, answer.response.SerializeToString())
+        self._file.execute("INSERT OR REPLACE INTO answers VALUES (?, ?, ?, ?, ?, ?)", row)
+
+    def answers(self, model: str, scene: str) -> Iterator[tuple[int, bool, Answer]]:
+        """Frame, kind and answer of every call about a scene, by frame."""
+        rows = self._file.execute(
+            "SELECT frame, challenge, seconds, response FROM answers WHERE model = ? AND scene = ? "
+            "ORDER BY frame, challenge",
+            (model, scene),
+        )
+        with closing(rows):
+            for frame, challenge, seconds, response in rows:
+                yield frame, bool(challenge), Answer(seconds, PredictResponse.FromString(response))
+
+
+def _same(known: Model, model: Model) -> bool:
+    """Whether two descriptions are of the same weights; which one is the default does not matter."""
+    plain = [Model.FromString(one.SerializeToString()) for one in (known, model)]
+    for one in plain:
+        one.is_default = False
+    return plain[0] == plain[1]

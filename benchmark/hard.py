@@ -1,0 +1,134 @@
+"""Hard cases: the pairs that the Kalman filter mistakes most (table 3), and what models made of them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmark.plan import HISTORY_FRAMES, PlannedScene
+from model.arrays import Floats
+from model.metrics.hard import HARD_SHARES, hardest
+from model.mixture import TrajectoryMixture
+from model.scene import Raster
+
+SHOWN = 6
+"""Hard cases that a report draws."""
+
+
+@dataclass(frozen=True)
+class CaseForecast:
+    """What one model forecast."""
+
+    weights: Floats
+    """[K]"""
+    modes: Floats
+    """[K, T, 2], m, ground frame."""
+    likeliest: Floats
+    """[T, 2], m, ground frame."""
+    fde_6s_m: float
+
+
+@dataclass(frozen=True)
+class HardCase:
+    """One pair, all that a picture of it shows."""
+
+    scene: str
+    agent: str
+    frame: int
+    mismatch_m: float
+    """FDE at 6 s of the Kalman filter."""
+    raster: Raster
+    history: Floats
+    """[F, 2], m, oldest first; the last one is now."""
+    truth: Floats
+    """[T, 2], m."""
+    others: Floats
+    """[M, 2], m: agents around it, now."""
+    forecasts: Mapping[str, CaseForecast]
+    """By ``name@version``."""
+
+
+def hardest_fde(fde_m: Floats, mismatch_m: Floats) -> dict[str, float]:
+    """Mean FDE on the hardest 1, 2 and 3 % of the pairs, and on all: ``fde_hardest_1_m`` … ``_all_m``.
+
+    Args:
+        fde_m: [N], m, at 6 s; NaN where there is no forecast.
+        mismatch_m: [N], m, the Kalman filter's; pairs where it is NaN have no rank and are left out.
+    """
+    ranked = np.isfinite(mismatch_m)
+    fde_m, mismatch_m = fde_m[ranked], mismatch_m[ranked]
+    figures = {}
+    if len(fde_m):
+        for share in HARD_SHARES:
+            figures[f"fde_hardest_{round(100 * share)}_m"] = _mean(fde_m[hardest(mismatch_m, share)])
+    figures["fde_hardest_all_m"] = _mean(fde_m)
+    return figures
+
+
+def shown_cases(scenes: Sequence[PlannedScene], mismatch_m: Floats) -> list[tuple[PlannedScene, int]]:
+    """The hardest pairs, the hardest first, one an agent: its scene and its number there.
+
+    Args:
+        scenes: of all pairs.
+        mismatch_m: [N], m, of all pairs in order.
+    """
+    where = [(scene, number) for scene in scenes for number in range(len(scene.pairs))]
+    shown: list[tuple[PlannedScene, int]] = []
+    seen: set[tuple[str, int]] = set()
+    for index in np.argsort(np.where(np.isfinite(mismatch_m), -mismatch_m, np.inf), kind="stable").tolist():
+        scene, number = where[index]
+        agent = (scene.record.name, scene.pairs[number].track)
+        if len(shown) == SHOWN or not np.isfinite(mismatch_m[index]):
+            break
+        if agent not in seen:
+            seen.add(agent)
+            shown.append((scene, number))
+    return shown
+
+
+def hard_case(
+    scene: PlannedScene, number: int, mismatch_m: float, mixtures: Mapping[str, TrajectoryMixture]
+) -> HardCase:
+    """One pair with its forecasts.
+
+    Args:
+        scene: that it is in.
+        number: of the pair in its scene.
+        mismatch_m: FDE at 6 s of the Kalman filter.
+        mixtures: by ``name@version``, of this one pair.
+    """
+    record, pair = scene.record, scene.pairs[number]
+    track = record.tracks[pair.track]
+    past = (track.frames <= pair.frame) & (track.frames > pair.frame - HISTORY_FRAMES)
+    others = [
+        other.position[other.frames == pair.frame]
+        for index, other in enumerate(record.tracks)
+        if index != pair.track
+    ]
+    truth = scene.truth()[number]
+    return HardCase(
+        scene=record.name,
+        agent=track.id,
+        frame=pair.frame,
+        mismatch_m=mismatch_m,
+        raster=record.raster,
+        history=track.position[past],
+        truth=truth,
+        others=np.concatenate([np.zeros((0, 2)), *others]),
+        forecasts={key: _forecast(mixture, truth) for key, mixture in mixtures.items()},
+    )
+
+
+def _forecast(mixture: TrajectoryMixture, truth: Floats) -> CaseForecast:
+    likeliest = mixture.most_likely_trajectory()[0].numpy()
+    return CaseForecast(
+        mixture.weights[0].double().numpy(),
+        mixture.world_means[0].numpy(),
+        likeliest,
+        float(np.hypot(*(likeliest[-1] - truth[-1]))),
+    )
+
+
+def _mean(values: Floats) -> float:
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if known.size else float("nan")

@@ -1,0 +1,137 @@
+"""What is asked of the endpoint: calls of one scene and frame each."""
+
+import hashlib
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.arrays import Floats, Ints
+from model.data.checks import FUTURE_STEPS, check_pairs
+from model.data.scenes import DataError, Pair, Reader, SceneRecord
+
+HISTORY_FRAMES = 5
+"""Frames of a full history, now included (the paper's H = 4 past ones)."""
+
+
+@dataclass(frozen=True)
+class Call:
+    """Forecasts of some agents of one frame.
+
+    A call of the challenge wants whole mixtures. The others are for dispersion and convergence, which look at
+    each agent's most likely trajectory alone.
+    """
+
+    frame: int
+    tracks: tuple[int, ...]
+    """Indices into the scene's tracks, ascending; each is asked for once a frame."""
+    challenge: bool
+
+
+@dataclass(frozen=True)
+class PlannedScene:
+    """A recorded scene and the calls about it."""
+
+    record: SceneRecord
+    pairs: Sequence[Pair]
+    """The challenge's that are asked for, ordered by frame, then by track."""
+    first: int
+    """Number of its first pair among those of all scenes."""
+    calls: tuple[Call, ...]
+    """Ordered by frame."""
+
+    @property
+    def forecasts(self) -> int:
+        """How many are asked of each model."""
+        return sum(len(call.tracks) for call in self.calls)
+
+    def truth(self) -> Floats:
+        """[N, 12, 2], m, ground frame: where the pairs' agents went."""
+        return np.stack([future(self.record, pair) for pair in self.pairs])
+
+    def origin(self) -> Floats:
+        """[N, 2], m, ground frame: where the pairs' agents are."""
+        return np.stack([position(self.record, pair.track, pair.frame) for pair in self.pairs])
+
+
+def plan_scenes(
+    reader: Reader, split: str, *, consistency: bool = True, limit: int | None = None
+) -> Iterator[PlannedScene]:
+    """Plans the scenes of a split, in order.
+
+    Args:
+        reader: of the data.
+        split: one of the reader's.
+        consistency: also ask for every agent of the challenge at every frame at which it has a full history.
+        limit: how many of the first pairs; None: all.
+
+    Raises:
+        DataError: the data is bad, or the split has no pairs.
+    """
+    first = 0
+    for record in reader.scenes(split):
+        check_pairs(record.name, record.tracks, record.pairs)
+        pairs = record.pairs if limit is None else record.pairs[: limit - first]
+        yield PlannedScene(record, pairs, first, tuple(_calls(record, pairs, consistency)))
+        first += len(pairs)
+        if first == limit:
+            return
+    if not first:
+        raise DataError(f"the split {split!r} has no pairs")
+
+
+def digest(scenes: Sequence[PlannedScene]) -> str:
+    """What is asked, and of what data, as one hexadecimal number: answers of another plan have another."""
+    whole = hashlib.sha256()
+    for scene in scenes:
+        whole.update(repr((scene.record.name, scene.first, scene.calls)).encode())
+        for track in scene.record.tracks:
+            whole.update(repr((track.id, track.type.value)).encode())
+            for values in (track.frames, track.position, track.heading):
+                whole.update(np.ascontiguousarray(values).tobytes())
+        whole.update(np.packbits(scene.record.raster.layers).tobytes())
+    return whole.hexdigest()
+
+
+def full_history(frames: Ints) -> Ints:
+    """Those of a track's frames before which, too, it was seen without a break for a full history.
+
+    Args:
+        frames: [F], ascending.
+    """
+    back = HISTORY_FRAMES - 1
+    if len(frames) <= back:
+        return frames[:0]
+    return frames[back:][frames[back:] - frames[:-back] == back]
+
+
+def position(record: SceneRecord, track: int, frame: int) -> Floats:
+    """[2], m, ground frame: where an agent is at one of its frames."""
+    of = record.tracks[track]
+    found: Floats = of.position[int(np.searchsorted(of.frames, frame))]
+    return found
+
+
+def future(record: SceneRecord, pair: Pair) -> Floats:
+    """[12, 2], m, ground frame: where a pair's agent goes."""
+    track = record.tracks[pair.track]
+    start = int(np.searchsorted(track.frames, pair.frame)) + 1
+    return track.position[start : start + FUTURE_STEPS]
+
+
+def _calls(record: SceneRecord, pairs: Sequence[Pair], consistency: bool) -> Iterator[Call]:
+    due: dict[int, set[int]] = defaultdict(set)
+    for pair in pairs:
+        due[pair.frame].add(pair.track)
+    others: dict[int, set[int]] = defaultdict(set)
+    if consistency:
+        for track in {pair.track for pair in pairs}:
+            for frame in full_history(record.tracks[track].frames).tolist():
+                if track not in due[frame]:
+                    others[frame].add(track)
+    for frame in sorted({*due, *others}):
+        if due[frame]:
+            yield Call(frame, tuple(sorted(due[frame])), challenge=True)
+        if others[frame]:
+            yield Call(frame, tuple(sorted(others[frame])), challenge=False)

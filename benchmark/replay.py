@@ -1,0 +1,134 @@
+"""Sends the calls of a plan, several at a time, and keeps the answers."""
+
+import asyncio
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from benchmark import BenchmarkError
+from benchmark.archive import Answer, Archive
+from benchmark.plan import Call, PlannedScene
+from benchmark.requests import SceneRequests
+from cab.forecast.v1.model_service_pb2 import Model
+from cab.forecast.v1.prediction_service_pb2 import PredictRequest
+from cab_forecast import AsyncClient, BadRequest, ForecastError, TooLarge
+from model.forecaster import Protocol
+
+RETRIES = 10_000
+"""Of a call: its timeout ends them."""
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A call that the endpoint will not answer."""
+
+    model: str
+    scene: str
+    frame: int
+    why: str
+
+
+@dataclass
+class Replayed:
+    """How a replay went."""
+
+    asked: int = 0
+    """Forecasts that were asked for now; what was in the archive is not asked again."""
+    seconds: float = 0.0
+    refusals: list[Refusal] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Replay:
+    """What is sent, and how."""
+
+    scenes: Sequence[PlannedScene]
+    models: Mapping[str, Model]
+    """By ``name@version``."""
+    protocol: Protocol
+    concurrency: int = 8
+    """Calls on their way at once."""
+    timeout: float = 60.0
+    """s for a call with its retries: also how long a lost server is waited for."""
+
+    def forecasts(self) -> int:
+        """How many answers there will be: one an agent, frame and model."""
+        return len(self.models) * sum(scene.forecasts for scene in self.scenes)
+
+    async def run(self, client: AsyncClient, archive: Archive, tick: Callable[[int], None]) -> Replayed:
+        """Asks whatever has no answer yet.
+
+        Overload and lost connections are waited out by the client. A request that the endpoint refuses for
+        what it says is noted; anything else ends the replay, with all answers kept.
+
+        Args:
+            client: of the endpoint.
+            archive: of the answers.
+            tick: told of every call how many forecasts it brought; first of what is there already.
+
+        Raises:
+            BenchmarkError: the endpoint does not answer.
+        """
+        done = archive.answered()
+        replayed = Replayed()
+        started = time.perf_counter()
+        work = self._work(done, tick)
+        # Every sender takes the next call when it is through with one: no queue that could grow
+        senders = [
+            asyncio.create_task(self._send(work, client, archive, replayed, tick))
+            for _ in range(self.concurrency)
+        ]
+        try:
+            await asyncio.gather(*senders)
+        except ForecastError as error:
+            raise BenchmarkError(
+                f"the endpoint does not answer: {error}; answers so far are kept, run again to go on"
+            ) from error
+        finally:
+            for sender in senders:
+                sender.cancel()
+            await asyncio.gather(*senders, return_exceptions=True)
+            replayed.seconds = time.perf_counter() - started
+        return replayed
+
+    async def _send(
+        self,
+        work: Iterator[tuple[str, PlannedScene, Call, PredictRequest]],
+        client: AsyncClient,
+        archive: Archive,
+        replayed: Replayed,
+        tick: Callable[[int], None],
+    ) -> None:
+        for model, scene, call, request in work:
+            started = time.perf_counter()
+            try:
+                response = await client.predict(request, timeout=self.timeout)
+            except (BadRequest, TooLarge) as error:
+                replayed.refusals.append(Refusal(model, scene.record.name, call.frame, str(error)))
+            else:
+                archive.add(model, scene.record.name, call, Answer(time.perf_counter() - started, response))
+            replayed.asked += len(call.tracks)
+            tick(len(call.tracks))
+
+    def _work(
+        self, done: set[tuple[str, str, int, bool]], tick: Callable[[int], None]
+    ) -> Iterator[tuple[str, PlannedScene, Call, PredictRequest]]:
+        """Calls without an answer, scene by scene, each with its request."""
+        frames = max(model.history_frames for model in self.models.values())
+        for scene in self.scenes:
+            requests = SceneRequests(scene, self.protocol, frames)
+            for call in scene.calls:
+                open_ = [
+                    model
+                    for model in self.models
+                    if (model, scene.record.name, call.frame, call.challenge) not in done
+                ]
+                tick(len(call.tracks) * (len(self.models) - len(open_)))
+                if not open_:
+                    continue
+                request = requests.request(call)
+                for model in open_:
+                    named = PredictRequest()
+                    named.CopyFrom(request)
+                    named.model = model
+                    yield model, scene, call, named

@@ -1,0 +1,45 @@
+"""Data sets by the names that commands take."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from model.data.nuscenes_pred import NuscenesPredReader
+from model.data.scenes import DataError, Reader
+from model.forecaster import Protocol
+
+
+def _official(path: Path) -> Reader:
+    from model.data.nuscenes import NuscenesReader  # noqa: PLC0415 (an extra, with numpy < 2)
+
+    try:
+        return NuscenesReader(path)
+    except ImportError as error:
+        raise DataError(f"official nuScenes data needs the extra benchmark: {error}") from error
+
+
+READERS: dict[str, Callable[[Path], Reader]] = {"nuscenes_pred": NuscenesPredReader, "nuscenes": _official}
+"""Readers of data sets by the KIND of KIND:PATH."""
+
+
+def parse_data(text: str) -> tuple[str, Path]:
+    """KIND and PATH of KIND:PATH.
+
+    Raises:
+        DataError: it is no such thing, or the kind is unknown.
+    """
+    kind, colon, path = text.partition(":")
+    if not colon or not path or kind not in READERS:
+        raise DataError(f"data: {text!r} is not KIND:PATH with KIND one of {', '.join(READERS)}")
+    return kind, Path(path)
+
+
+def parse_protocol(name: str) -> Protocol:
+    """A protocol by its name.
+
+    Raises:
+        DataError: there is none of that name.
+    """
+    try:
+        return Protocol(name)
+    except ValueError:
+        raise DataError(f"there is no protocol {name!r}; there are {', '.join(Protocol)}") from None
