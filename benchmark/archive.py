@@ -106,7 +106,8 @@ class Archive:
         known = self.models().get(key)
         if known is not None and not _same(known, model):
             raise BenchmarkError(
-                f"{self._path}: {key} of the endpoint is not the one whose answers are here; give another folder"
+                f"{self._path}: {key} of the endpoint is not the one whose answers are here; "
+                "give another folder"
             )
         self._file.execute("INSERT OR REPLACE INTO models VALUES (?, ?)", (key, model.SerializeToString()))
 

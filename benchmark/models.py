@@ -44,10 +44,7 @@ def choose(listed: Sequence[Model], protocol: Protocol, names: Sequence[str] = (
         BenchmarkError: the endpoint has no such model, or none that fits.
     """
     fitting = [one for one in listed if not learned(one) or protocol_of(one) is protocol]
-    if not names:
-        chosen = fitting
-    else:
-        chosen = [_named(name, listed, fitting) for name in names]
+    chosen = [_named(name, listed, fitting) for name in names] if names else fitting
     if not chosen:
         raise BenchmarkError(f"the endpoint lists no model of the {protocol.value} protocol")
     return {key(one): one for one in chosen}

@@ -101,9 +101,9 @@ def full_history(frames: Ints) -> Ints:
         frames: [F], ascending.
     """
     back = HISTORY_FRAMES - 1
-    if len(frames) <= back:
-        return frames[:0]
-    return frames[back:][frames[back:] - frames[:-back] == back]
+    late, early = frames[back:], frames[: max(len(frames) - back, 0)]
+    full: Ints = late[late - early == back]
+    return full
 
 
 def position(record: SceneRecord, track: int, frame: int) -> Floats:

@@ -20,12 +20,11 @@ from model.scene import AgentType
 from model.training import processes
 from model.training.calibration import fit_width, widen
 from model.training.card import LICENSE, Origin, model_card
-from model.training.config import TrainingConfig, TrainingError
+from model.training.config import TrainingConfig
 from model.training.logs import RunLog
 from model.training.loop import Report, Trainer
 from model.training.state import Progress
 from model.training.validation import Validation
-
 
 SAMPLES = 200
 """Trajectories a pair for the sampled figures of a card."""
