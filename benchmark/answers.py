@@ -60,23 +60,24 @@ def read_answers(archive: Archive, model: str, scene: PlannedScene) -> SceneAnsw
     """
     tracks = {track.id: number for number, track in enumerate(scene.record.tracks)}
     numbers = {(pair.track, pair.frame): number for number, pair in enumerate(scene.pairs)}
-    asked = {(call.frame, call.challenge): set(call.tracks) for call in scene.calls}
+    calls = {call.frame: call for call in scene.calls}
     found: dict[int, Forecast] = {}
     paths: dict[int, list[tuple[int, Floats]]] = {}
     statuses: Counter[str] = Counter()
     answers: list[Answer] = []
-    for frame, challenge, answer in archive.answers(model, scene.record.name):
+    for frame, answer in archive.answers(model, scene.record.name):
         answers.append(answer)
         for forecast in forecasts(answer.response).values():
             track = tracks[forecast.agent_id]
-            if track not in asked[frame, challenge]:  # an invalid context agent
+            if track not in calls[frame].tracks:  # an invalid context agent
                 continue
-            if challenge:
+            due = track in calls[frame].due
+            if due:
                 statuses[forecast.status.value] += 1
             if not len(forecast.weights):
                 continue
             paths.setdefault(track, []).append((frame, forecast.most_likely))
-            if challenge:
+            if due:
                 found[numbers[track, frame]] = forecast
     statuses[MISSING] = len(scene.pairs) - sum(statuses.values())
     instances = np.array(sorted(found), dtype=np.int64)

@@ -22,11 +22,10 @@ FILE = "answers.sqlite"
 
 _TABLES = """
 CREATE TABLE IF NOT EXISTS run (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS models (key TEXT PRIMARY KEY, model BLOB NOT NULL) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS models (key TEXT PRIMARY KEY, model BLOB NOT NULL);
 CREATE TABLE IF NOT EXISTS answers (
-    model TEXT NOT NULL, scene TEXT NOT NULL, frame INTEGER NOT NULL, challenge INTEGER NOT NULL,
-    seconds REAL NOT NULL, response BLOB NOT NULL,
-    PRIMARY KEY (model, scene, frame, challenge)
+    model TEXT NOT NULL, scene TEXT NOT NULL, frame INTEGER NOT NULL, seconds REAL NOT NULL,
+    response BLOB NOT NULL, PRIMARY KEY (model, scene, frame)
 );
 """
 
@@ -93,8 +92,12 @@ class Archive:
                 )
         self._file.executemany("INSERT OR REPLACE INTO run VALUES (?, ?)", facts.items())
 
+    def note(self, name: str, value: str) -> None:
+        """Notes a fact that may change from one time to the next."""
+        self._file.execute("INSERT OR REPLACE INTO run VALUES (?, ?)", (name, value))
+
     def facts(self) -> dict[str, str]:
-        """What it is tied to."""
+        """What it is tied to, and what was noted."""
         return dict(self._file.execute("SELECT key, value FROM run"))
 
     def register(self, key: str, model: Model) -> None:
@@ -109,33 +112,34 @@ class Archive:
                 f"{self._path}: {key} of the endpoint is not the one whose answers are here; "
                 "give another folder"
             )
-        self._file.execute("INSERT OR REPLACE INTO models VALUES (?, ?)", (key, model.SerializeToString()))
+        row = (key, model.SerializeToString())
+        self._file.execute(
+            "INSERT INTO models VALUES (?, ?) ON CONFLICT DO UPDATE SET model = excluded.model", row
+        )
 
     def models(self) -> dict[str, Model]:
-        """Models that have been asked, by ``name@version``, in the order of their names."""
-        rows = self._file.execute("SELECT key, model FROM models ORDER BY key")
+        """Models that have been asked, by ``name@version``, in the order of their registration."""
+        rows = self._file.execute("SELECT key, model FROM models ORDER BY rowid")
         return {key: Model.FromString(model) for key, model in rows}
 
-    def answered(self) -> set[tuple[str, str, int, bool]]:
-        """Model, scene, frame and kind of every call that has its answer."""
-        rows = self._file.execute("SELECT model, scene, frame, challenge FROM answers")
-        return {(model, scene, frame, bool(challenge)) for model, scene, frame, challenge in rows}
+    def answered(self) -> set[tuple[str, str, int]]:
+        """Model, scene and frame of every call that has its answer."""
+        return set(self._file.execute("SELECT model, scene, frame FROM answers"))
 
     def add(self, model: str, scene: str, call: Call, answer: Answer) -> None:
         """Keeps an answer."""
-        row = (model, scene, call.frame, call.challenge, answer.seconds, answer.response.SerializeToString())
-        self._file.execute("INSERT OR REPLACE INTO answers VALUES (?, ?, ?, ?, ?, ?)", row)
+        row = (model, scene, call.frame, answer.seconds, answer.response.SerializeToString())
+        self._file.execute("INSERT OR REPLACE INTO answers VALUES (?, ?, ?, ?, ?)", row)
 
-    def answers(self, model: str, scene: str) -> Iterator[tuple[int, bool, Answer]]:
-        """Frame, kind and answer of every call about a scene, by frame."""
+    def answers(self, model: str, scene: str) -> Iterator[tuple[int, Answer]]:
+        """Frame and answer of every call about a scene, by frame."""
         rows = self._file.execute(
-            "SELECT frame, challenge, seconds, response FROM answers WHERE model = ? AND scene = ? "
-            "ORDER BY frame, challenge",
+            "SELECT frame, seconds, response FROM answers WHERE model = ? AND scene = ? ORDER BY frame",
             (model, scene),
         )
         with closing(rows):
-            for frame, challenge, seconds, response in rows:
-                yield frame, bool(challenge), Answer(seconds, PredictResponse.FromString(response))
+            for frame, seconds, response in rows:
+                yield frame, Answer(seconds, PredictResponse.FromString(response))
 
 
 def _same(known: Model, model: Model) -> bool:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.arrays import Floats, Ints
-from model.data.checks import FUTURE_STEPS, check_pairs
+from model.data.checks import STEPS_AHEAD, check_pairs
 from model.data.scenes import DataError, Pair, Reader, SceneRecord
 
 HISTORY_FRAMES = 5
@@ -17,16 +17,14 @@ HISTORY_FRAMES = 5
 
 @dataclass(frozen=True)
 class Call:
-    """Forecasts of some agents of one frame.
-
-    A call of the challenge wants whole mixtures. The others are for dispersion and convergence, which look at
-    each agent's most likely trajectory alone.
-    """
+    """Forecasts of some agents of one frame."""
 
     frame: int
     tracks: tuple[int, ...]
-    """Indices into the scene's tracks, ascending; each is asked for once a frame."""
-    challenge: bool
+    """Those to be forecast: indices into the scene's tracks, ascending."""
+    due: frozenset[int]
+    """Those of them that the challenge asks for at this frame. The others are asked for dispersion and
+    convergence, which look at an agent's most likely trajectory alone."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +46,16 @@ class PlannedScene:
 
     def truth(self) -> Floats:
         """[N, 12, 2], m, ground frame: where the pairs' agents went."""
-        return np.stack([future(self.record, pair) for pair in self.pairs])
+        return self._positions(STEPS_AHEAD)
 
     def origin(self) -> Floats:
         """[N, 2], m, ground frame: where the pairs' agents are."""
-        return np.stack([position(self.record, pair.track, pair.frame) for pair in self.pairs])
+        return self._positions(np.array(0))
+
+    def _positions(self, ahead: Ints) -> Floats:
+        """Where the pairs' agents are so many frames later: [N, ..., 2], m."""
+        tracks = self.record.tracks
+        return np.stack([tracks[pair.track].positions(pair.frame + ahead) for pair in self.pairs])
 
 
 def plan_scenes(
@@ -85,7 +88,7 @@ def digest(scenes: Sequence[PlannedScene]) -> str:
     """What is asked, and of what data, as one hexadecimal number: answers of another plan have another."""
     whole = hashlib.sha256()
     for scene in scenes:
-        whole.update(repr((scene.record.name, scene.first, scene.calls)).encode())
+        whole.update(repr((scene.record.name, scene.first, scene.pairs, scene.calls)).encode())
         for track in scene.record.tracks:
             whole.update(repr((track.id, track.type.value)).encode())
             for values in (track.frames, track.position, track.heading):
@@ -106,32 +109,14 @@ def full_history(frames: Ints) -> Ints:
     return full
 
 
-def position(record: SceneRecord, track: int, frame: int) -> Floats:
-    """[2], m, ground frame: where an agent is at one of its frames."""
-    of = record.tracks[track]
-    found: Floats = of.position[int(np.searchsorted(of.frames, frame))]
-    return found
-
-
-def future(record: SceneRecord, pair: Pair) -> Floats:
-    """[12, 2], m, ground frame: where a pair's agent goes."""
-    track = record.tracks[pair.track]
-    start = int(np.searchsorted(track.frames, pair.frame)) + 1
-    return track.position[start : start + FUTURE_STEPS]
-
-
 def _calls(record: SceneRecord, pairs: Sequence[Pair], consistency: bool) -> Iterator[Call]:
     due: dict[int, set[int]] = defaultdict(set)
     for pair in pairs:
         due[pair.frame].add(pair.track)
-    others: dict[int, set[int]] = defaultdict(set)
+    asked = {frame: set(tracks) for frame, tracks in due.items()}
     if consistency:
         for track in {pair.track for pair in pairs}:
             for frame in full_history(record.tracks[track].frames).tolist():
-                if track not in due[frame]:
-                    others[frame].add(track)
-    for frame in sorted({*due, *others}):
-        if due[frame]:
-            yield Call(frame, tuple(sorted(due[frame])), challenge=True)
-        if others[frame]:
-            yield Call(frame, tuple(sorted(others[frame])), challenge=False)
+                asked.setdefault(frame, set()).add(track)
+    for frame in sorted(asked):
+        yield Call(frame, tuple(sorted(asked[frame])), frozenset(due.get(frame, ())))

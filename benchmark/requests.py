@@ -50,7 +50,6 @@ class SceneRequests:
             time=call.frame * STEP_SECONDS,
             agents=agents,
             raster=crop(self._scene.record.raster, around) if len(around) else None,
-            max_modes=0 if call.challenge else 1,
         )
 
     def _agent(self, observations: Observations, row: int, track: int, predict: bool) -> Agent:
@@ -83,4 +82,4 @@ def crop(raster: Raster, around: Floats) -> SceneRaster | None:
     part = raster.layers[:, low[0] : high[0], low[1] : high[1]]
     if not part.size:
         return None
-    return scene_raster(part, (raster.origin + low / scale).tolist(), scale)
+    return scene_raster(part != 0, (raster.origin + low / scale).tolist(), scale)

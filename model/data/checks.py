@@ -10,6 +10,8 @@ from model.scene import AgentType, Raster
 
 FUTURE_STEPS = 12
 """Frames of truth behind the present: 6 s."""
+STEPS_AHEAD = np.arange(1, FUTURE_STEPS + 1)
+"""[12], these frames, counted from the present."""
 
 
 def check_pairs(where: str, tracks: Sequence[Track], pairs: Sequence[Pair]) -> None:

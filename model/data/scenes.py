@@ -4,6 +4,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol as Interface
 
+import numpy as np
+
 from model.arrays import Floats, Ints
 from model.scene import AgentType, Raster
 
@@ -25,6 +27,12 @@ class Track:
     """[F, 2], m, ground frame."""
     heading: Floats
     """[F], rad."""
+
+    def positions(self, frames: Ints) -> Floats:
+        """Where it was at any frames [...]: [..., 2], m, ground frame; NaN where it was not annotated."""
+        row = np.minimum(np.searchsorted(self.frames, frames), len(self.frames) - 1)
+        there = self.frames[row] == frames
+        return np.where(there[..., None], self.position[row], np.nan)
 
 
 @dataclass(frozen=True)

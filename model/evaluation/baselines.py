@@ -3,15 +3,14 @@
 They forecast from the scene, as in the server: a cache of pairs does not hold what they need.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from model import physics
 from model.arrays import Floats
-from model.data.checks import FUTURE_STEPS, check_pairs
+from model.data.checks import FUTURE_STEPS, STEPS_AHEAD, check_pairs
 from model.data.protocols import SceneFrames
 from model.data.scenes import DataError, Pair, Reader, SceneRecord
 from model.evaluation.subjects import ORACLE, key
@@ -19,12 +18,8 @@ from model.forecaster import Features, Forecaster, Protocol, join
 from model.kalman import HISTORY_FRAMES
 from model.metrics.aggregate import MetricMeans
 from model.metrics.evaluate import instance_metrics
-from model.metrics.oracle import PHYSICS, physics_oracle
-from model.mixture import TrajectoryMixture
+from model.metrics.oracle import oracle_figures, oracle_mixture
 from model.scene import AgentType, Raster
-
-_OF_THE_LIKELIEST = ("ade_ml_", "fde_ml_", "off_road_ml")
-"""The oracle's figures: it states one trajectory, and no density that could be judged."""
 
 
 @dataclass(frozen=True)
@@ -85,33 +80,13 @@ def judge_baselines(
             )
             means[key(one.info)].add(metrics)
         if oracle:
-            best = oracle_forecast(mixtures, pairs.truth)
-            metrics = instance_metrics(best, pairs.truth, rasters)
-            means[ORACLE].add({n: v for n, v in metrics.items() if n.startswith(_OF_THE_LIKELIEST)})
+            best = oracle_mixture(mixtures, pairs.truth)
+            means[ORACLE].add(oracle_figures(instance_metrics(best, pairs.truth, rasters)))
         done += count
         tick(done)
     if not done:
         raise DataError(f"the split {split!r} has no pairs")
     return means
-
-
-def oracle_forecast(mixtures: Mapping[str, TrajectoryMixture], truth: Floats) -> TrajectoryMixture:
-    """Of the four physics forecasts of each pair, the one nearest to the truth on the mean.
-
-    Args:
-        mixtures: by the models' names, of N pairs, one mode; others than physics are left aside.
-        truth: [N, T, 2], m, ground frame, finite.
-    """
-    four = [mixtures[name] for name in PHYSICS]
-    trajectories = np.stack([one.most_likely_trajectory().numpy() for one in four], axis=1)
-    choice = torch.from_numpy(physics_oracle(trajectories, truth).choice)
-    rows = torch.arange(len(truth))
-    return TrajectoryMixture(
-        *(
-            torch.stack([getattr(one, name) for one in four])[choice, rows]
-            for name in ("log_weights", "means", "covariances", "origin")
-        )
-    )
 
 
 def scene_pairs(
@@ -143,12 +118,5 @@ def _scene(
         targets = np.searchsorted(tracks, [pair.track for pair in pairs if pair.frame == frame])
         for forecaster, part in zip(forecasters, parts, strict=True):
             part.append(forecaster.prepare(scene, targets))
-    truth = np.stack([_future(record, pair) for pair in pairs])
+    truth = np.stack([record.tracks[pair.track].positions(pair.frame + STEPS_AHEAD) for pair in pairs])
     return ScenePairs([join(part) for part in parts], truth, record.raster)
-
-
-def _future(record: SceneRecord, pair: Pair) -> Floats:
-    """[12, 2], m, ground frame."""
-    track = record.tracks[pair.track]
-    start = int(np.searchsorted(track.frames, pair.frame)) + 1
-    return track.position[start : start + FUTURE_STEPS]

@@ -1,17 +1,21 @@
-"""Table 1 of Ben-Younes et al. 2022 (arXiv 2109.08048), to stand beside our figures.
+"""Tables 1 to 3 of Ben-Younes et al. 2022 (arXiv 2109.08048), to stand beside our figures.
 
-Its states are those of the paper protocol, and its pairs those of the paper's own split.
+Their states are those of the paper protocol, and their pairs those of the paper's own split. All are by our
+names of the models, and tell their figures by ours of the metrics.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+
+from model.metrics.convergence import RANGES_M
+from model.metrics.hard import HARD_SHARES
 
 Horizons = tuple[float, float, float, float, float, float]
 
 
 @dataclass(frozen=True)
 class Published:
-    """A row of the table."""
+    """A row of table 1: displacement errors and the driveable area."""
 
     ade_ml_m: Horizons
     """At 1 … 6 s."""
@@ -29,6 +33,39 @@ class Published:
         if self.sampled is not None:
             figures |= dict(zip(("ade_f_6s_m", "fde_f_6s_m", "off_road_f"), self.sampled, strict=True))
         return figures
+
+
+@dataclass(frozen=True)
+class PublishedConsistency:
+    """A row of table 2: how forecasts change as their agent drives on."""
+
+    dispersion_m: float
+    """D."""
+    convergence_s: tuple[float, float, float]
+    """C(0.2 m), C(1 m) and C(5 m)."""
+
+    def figures(self) -> dict[str, float]:
+        """By the names of ``benchmark.consistency``.
+
+        D is under two of them: the standard deviation is what the paper's formula says, and the mean distance
+        is what its figures fit better (REFERENCE.md section 4).
+        """
+        names = [f"convergence_{range_m:g}m_s" for range_m in RANGES_M]
+        figures = dict.fromkeys(("dispersion_std_m", "dispersion_mean_m"), self.dispersion_m)
+        return figures | dict(zip(names, self.convergence_s, strict=True))
+
+
+@dataclass(frozen=True)
+class PublishedHardCases:
+    """A row of table 3: where the Kalman filter errs most."""
+
+    fde_6s_m: tuple[float, float, float, float]
+    """On the hardest 1, 2 and 3 % of the pairs, and on all."""
+
+    def figures(self) -> dict[str, float]:
+        """By the names of ``benchmark.hard``."""
+        names = [*(f"fde_hardest_{round(100 * share)}_m" for share in HARD_SHARES), "fde_hardest_all_m"]
+        return dict(zip(names, self.fde_6s_m, strict=True))
 
 
 PUBLISHED: Mapping[str, Published] = {
@@ -61,4 +98,41 @@ PUBLISHED: Mapping[str, Published] = {
         (0.12, 0.34, 0.73, 1.29, 2.01, 2.90), (0.14, 0.73, 1.81, 3.39, 5.47, 8.02), 0.13, (3.41, 9.03, 0.20)
     ),
 }
-"""By our names of the models."""
+"""Table 1."""
+
+PUBLISHED_CONSISTENCY: Mapping[str, PublishedConsistency] = {
+    "constant-acceleration-yaw": PublishedConsistency(6.55, (0.44, 1.49, 3.30)),
+    "constant-acceleration-yaw-rate": PublishedConsistency(6.03, (0.47, 1.58, 3.46)),
+    "constant-speed-yaw-rate": PublishedConsistency(3.42, (0.54, 1.82, 4.15)),
+    "constant-velocity-yaw": PublishedConsistency(3.33, (0.53, 1.82, 4.16)),
+    "physics-oracle": PublishedConsistency(2.99, (0.55, 1.91, 4.38)),
+    "covernet": PublishedConsistency(4.06, (0.15, 0.93, 3.50)),
+    "trajectron-no-context": PublishedConsistency(3.65, (1.00, 2.11, 4.17)),
+    "trajectron": PublishedConsistency(3.55, (0.98, 2.11, 4.22)),
+    "halentnet-no-context": PublishedConsistency(2.85, (1.03, 2.28, 4.59)),
+    "halentnet": PublishedConsistency(3.23, (0.90, 2.07, 4.26)),
+    "reweight": PublishedConsistency(3.02, (1.03, 2.27, 4.50)),
+    "rubiz": PublishedConsistency(2.73, (0.94, 2.31, 4.60)),
+    "cab": PublishedConsistency(2.61, (1.12, 2.45, 4.74)),
+}
+"""Table 2."""
+
+PUBLISHED_HARD_CASES: Mapping[str, PublishedHardCases] = {
+    "trajectron-no-context": PublishedHardCases((15.80, 15.58, 14.97, 10.94)),
+    "trajectron": PublishedHardCases((13.12, 12.69, 12.25, 10.45)),
+    "halentnet": PublishedHardCases((14.12, 12.83, 12.09, 8.83)),
+    "reweight": PublishedHardCases((14.00, 13.30, 12.58, 8.58)),
+    "rubiz": PublishedHardCases((13.42, 12.49, 11.64, 8.21)),
+    "cab": PublishedHardCases((12.13, 11.88, 11.59, 8.02)),
+}
+"""Table 3."""
+
+
+def published_figures(model: str) -> dict[str, float]:
+    """All that the paper has of a model, by the names of the metrics; empty: nothing."""
+    tables = (PUBLISHED, PUBLISHED_CONSISTENCY, PUBLISHED_HARD_CASES)
+    figures: dict[str, float] = {}
+    for table in tables:
+        if model in table:
+            figures |= table[model].figures()
+    return figures

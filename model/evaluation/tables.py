@@ -2,24 +2,12 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 from model.evaluation.ablation import Without
 from model.evaluation.published import PUBLISHED
 from model.evaluation.results import Results, Row
+from model.evaluation.text_tables import NOTHING, Table, document, metrics_table, number
 from model.metrics.displacement import HORIZONS_S
-
-NOTHING = "-"
-
-
-@dataclass(frozen=True)
-class Table:
-    """Columns of text; the first is the model."""
-
-    title: str
-    note: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
 
 
 def tables(results: Results) -> list[Table]:
@@ -35,12 +23,7 @@ def tables(results: Results) -> list[Table]:
 
 def markdown(results: Results) -> str:
     """All tables, each with what it is of."""
-    parts = [f"# Evaluation: {results.statement()}"]
-    for table in tables(results):
-        parts.append(f"## {table.title}\n\n{table.note}")
-        lines = [table.columns, ("---", *("--:" for _ in table.columns[1:])), *table.rows]
-        parts.append("\n".join(f"| {' | '.join(line)} |" for line in lines))
-    return "\n\n".join(parts) + "\n"
+    return document(f"Evaluation: {results.statement()}", tables(results))
 
 
 def _most_likely(results: Results) -> Table:
@@ -119,10 +102,7 @@ def _context(results: Results) -> Table:
 
 def _plain(title: str, note: str, columns: Mapping[str, str], rows: Sequence[Row]) -> Table:
     """A column a metric."""
-    cells = tuple(
-        (_label(row, rows), *(_number(row.metrics, metric) for metric in columns.values())) for row in rows
-    )
-    return Table(title, note, ("model", *columns), cells)
+    return metrics_table(title, note, columns, ((_label(row, rows), row.metrics) for row in rows))
 
 
 def _label(row: Row, rows: Sequence[Row]) -> str:
@@ -132,8 +112,7 @@ def _label(row: Row, rows: Sequence[Row]) -> str:
 
 
 def _number(figures: Mapping[str, float], name: str) -> str:
-    value = figures.get(name, math.nan)
-    return NOTHING if math.isnan(value) else f"{value:.2f}"
+    return number(figures.get(name, math.nan))
 
 
 def _loss(row: Row, without: Without, figure: str) -> str:

@@ -1,12 +1,15 @@
 """The physics oracle: of several physics forecasts the one that turned out best. It needs the truth."""
 
+from collections.abc import Mapping
 from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
+import torch
 
 from model.arrays import Floats, Ints
 from model.metrics.displacement import displacement_m
+from model.mixture import TrajectoryMixture
 
 PHYSICS = (
     "constant-velocity-yaw",
@@ -15,6 +18,8 @@ PHYSICS = (
     "constant-acceleration-yaw-rate",
 )
 """Names of the models that it chooses from, in the order that settles ties."""
+
+_OF_THE_LIKELIEST = ("ade_ml_", "fde_ml_", "off_road_ml")
 
 
 class Criterion(StrEnum):
@@ -61,3 +66,28 @@ def physics_oracle(
     return OracleChoice(
         np.where(known[:, 0], index, -1).astype(np.int64), np.where(known[..., None], chosen, np.nan)
     )
+
+
+def oracle_mixture(mixtures: Mapping[str, TrajectoryMixture], truth: Floats) -> TrajectoryMixture:
+    """Of the four physics forecasts of each pair, the one nearest to the truth on the mean.
+
+    Args:
+        mixtures: by the models' names, of N pairs, one mode; others than physics are left aside.
+        truth: [N, T, 2], m, ground frame, finite.
+    """
+    four = [mixtures[name] for name in PHYSICS]
+    trajectories = np.stack([one.most_likely_trajectory().numpy() for one in four], axis=1)
+    choice = torch.from_numpy(physics_oracle(trajectories, truth).choice)
+    rows = torch.arange(len(truth))
+    return TrajectoryMixture(
+        *(
+            torch.stack([getattr(one, name) for one in four])[choice, rows]
+            for name in ("log_weights", "means", "covariances", "origin")
+        )
+    )
+
+
+def oracle_figures(metrics: Mapping[str, Floats]) -> dict[str, Floats]:
+    """Those of ``instance_metrics`` that mean something of the oracle: it states one trajectory, and no
+    density that could be judged."""
+    return {name: values for name, values in metrics.items() if name.startswith(_OF_THE_LIKELIEST)}

@@ -49,6 +49,9 @@ class TrainingConfig(BaseModel):
     """Of KL(q ‖ p), at the end of its annealing; as released, 100."""
     least_step_likelihood: float = -6.0
     """nats; see ``objectives.Weights``."""
+    apart_weight: float = Field(default=5.0, ge=0)
+    """λ_KL, of CAB alone: how much full and blind latents are pressed apart; as released, 5, beside a
+    ``kl_weight`` of 100."""
     displacement_weight: float = Field(default=0.0, ge=0)
     """1/m, of the distance of the modes from the truth, expected under p(z | x); as released, 0. The
     likelihood alone leaves it open which mode is the likeliest: this asks that it be a near one."""

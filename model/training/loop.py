@@ -153,6 +153,7 @@ class Trainer:
             Z_LOGIT_CLIP(annealed),
             least_step_likelihood=self.config.least_step_likelihood,
             displacement=self.config.displacement_weight,
+            apart=self.config.apart_weight,
         )
         terms = self.learner.step(batches, weights, self._rate())
         self.progress = replace(self.progress, step=step + 1)

@@ -32,6 +32,8 @@ class Weights:
     what is forecast worse than that then has no gradient."""
     displacement: float = 0.0
     """1/m, of ``elbo.expected_displacement``; 0, as released, leaves it out."""
+    apart: float = 5.0
+    """λ_KL of CAB: how much full and blind latents are pressed apart; as released, 5."""
 
 
 class Loss(NamedTuple):
@@ -48,8 +50,6 @@ MOST_STEP_LIKELIHOOD = 6.0
 """nats; a step's log-likelihood is clamped there, so that standing agents do not take over the loss."""
 RUBIZ_FULL = 0.1
 """RUBiZ's weight of the full log-likelihood."""
-BLIND_KL = 5.0
-"""λ_KL of CAB: how much full and blind latents are pressed apart."""
 
 
 def trajectron(network: AgentNetwork, features: Features, future: Tensor, weights: Weights) -> Loss:
@@ -67,7 +67,7 @@ def cab(network: AgentNetwork, features: Features, future: Tensor, weights: Weig
     full, blind = _both(network, features, future, weights)
     bounds = [_bound(terms, weights) for terms in (full, blind)]
     apart = divergence(full.log_prior, blind.log_prior.detach())
-    value = bounds[0].value() + bounds[1].value() - BLIND_KL * apart
+    value = bounds[0].value() + bounds[1].value() - weights.apart * apart
     return Loss(value, bounds[0].named("full") | bounds[1].named("blind") | {"kl_full_blind": apart})
 
 

@@ -44,7 +44,9 @@ def evaluate(
     from model.data.sources import READERS, parse_data, parse_protocol  # noqa: PLC0415
     from model.evaluation.run import Evaluation, write_results  # noqa: PLC0415
     from model.evaluation.subjects import EvaluationError, choose  # noqa: PLC0415
-    from service.cli.evaluation import show_evaluation, show_tables  # noqa: PLC0415
+    from model.evaluation.tables import tables  # noqa: PLC0415
+    from service.cli.evaluation import show_evaluation  # noqa: PLC0415
+    from service.cli.tables import show_tables  # noqa: PLC0415
     from service.settings import bundled_models  # noqa: PLC0415
 
     names = [name.strip() for name in (only or "").split(",") if name.strip()]
@@ -62,4 +64,4 @@ def evaluate(
         write_results(results, out)
     except (DataError, CheckpointError, EvaluationError, OSError) as error:
         fail(str(error))
-    show_tables(results, out)
+    show_tables(tables(results), out)

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli import convert, evaluate, predict, serve, train
+from service.cli import benchmark, convert, evaluate, predict, serve, train
 
 app = typer.Typer(
     name="cab-forecast",
@@ -35,3 +35,4 @@ predict.register(app)
 convert.register(app)
 train.register(app)
 evaluate.register(app)
+benchmark.register(app)

@@ -57,6 +57,7 @@ ROWS = [
     (Failure("RESOURCE_EXHAUSTED", 429, "OVERLOADED", retry_after=0.25), Overloaded),
     (Failure("DEADLINE_EXCEEDED", 504, "DEADLINE_EXCEEDED"), DeadlineExceeded),
     (Failure("UNAVAILABLE", 503, "DRAINING", retry_after=1.5), Unavailable),
+    (Failure("CANCELLED", 499, ""), Unavailable),
     (Failure("INTERNAL", 500, "INTERNAL"), InternalError),
     (Failure("UNIMPLEMENTED", 405, "METHOD_NOT_ALLOWED"), ForecastError),
 ]

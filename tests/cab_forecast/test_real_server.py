@@ -1,7 +1,6 @@
 """The client against the real server, on free ports."""
 
 import asyncio
-import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -21,6 +20,7 @@ from cab_forecast import (
 )
 from service.server import Server
 from service.settings import Settings
+from tests.service.servers import in_thread
 
 TOKEN = "a-token"  # noqa: S105
 MODEL = "constant-velocity-yaw"
@@ -28,7 +28,7 @@ MODEL = "constant-velocity-yaw"
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """The server with its baselines, in a loop and thread of its own: blocking clients call it."""
+    """The server with its baselines."""
     settings = Settings(
         http="127.0.0.1:0",
         grpc="127.0.0.1:0",
@@ -37,23 +37,8 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
         max_batch_agents=32,
         api_tokens=(SecretStr(TOKEN),),
     )
-    loop = asyncio.new_event_loop()
-    thread = threading.Thread(target=loop.run_forever)
-    thread.start()
-
-    async def start() -> Server:
-        started = Server(settings)
-        await started.start()
-        return started
-
-    try:
-        running = asyncio.run_coroutine_threadsafe(start(), loop).result(120)
+    with in_thread(settings) as running:
         yield running
-        asyncio.run_coroutine_threadsafe(running.stop(), loop).result(30)
-    finally:
-        loop.call_soon_threadsafe(loop.stop)
-        thread.join()
-        loop.close()
 
 
 @pytest.fixture(params=["grpc", "http", "http-json"])

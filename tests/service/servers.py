@@ -1,8 +1,9 @@
 """Real servers on free ports, and ways to call them."""
 
 import asyncio
-from collections.abc import AsyncIterator, Mapping
-from contextlib import asynccontextmanager
+import threading
+from collections.abc import AsyncIterator, Iterator, Mapping
+from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -38,6 +39,30 @@ async def running(*forecasters: Forecaster, **values: Any) -> AsyncIterator[Serv
         yield server
     finally:
         await server.stop()
+
+
+@contextmanager
+def in_thread(with_settings: Settings) -> Iterator[Server]:
+    """A server in a loop and thread of its own, for clients that block."""
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever)
+    thread.start()
+
+    async def start() -> Server:
+        started = Server(with_settings)
+        await started.start()
+        return started
+
+    try:
+        server = asyncio.run_coroutine_threadsafe(start(), loop).result(120)
+        try:
+            yield server
+        finally:
+            asyncio.run_coroutine_threadsafe(server.stop(), loop).result(30)
+    finally:
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join()
+        loop.close()
 
 
 async def until_waiting(server: Server, agents: int) -> None:

@@ -8,12 +8,12 @@ from model import physics
 from model.data.cache import Cache, build_cache
 from model.data.protocols import frame_scene
 from model.data.scenes import DataError, Pair, SceneRecord
-from model.evaluation.baselines import judge_baselines, oracle_forecast, scene_pairs
+from model.evaluation.baselines import judge_baselines, scene_pairs
 from model.evaluation.subjects import ORACLE
 from model.forecaster import Protocol
 from model.kalman import Kalman
 from model.metrics.evaluate import instance_metrics
-from model.metrics.oracle import PHYSICS
+from model.metrics.oracle import PHYSICS, oracle_mixture
 from model.networks.config import NetworkConfig
 from model.single import single_mode
 from tests.model.data.records import FixedReader, raster, record, track
@@ -36,10 +36,10 @@ def test_the_oracle_chooses_for_each_pair_by_hand() -> None:
         for name, errors in off.items()
     }
     truth = np.repeat(origin.numpy()[:, None], 2, axis=1)
-    best = oracle_forecast(mixtures, truth)
+    best = oracle_mixture(mixtures, truth)
     assert best.means[:, 0].tolist() == [[[0, 2], [0, 0]], [[0, 2], [0, 2]]]
     assert torch.equal(best.origin, origin)
-    metrics = instance_metrics(oracle_forecast(mixtures, truth), truth)
+    metrics = instance_metrics(oracle_mixture(mixtures, truth), truth)
     assert metrics["ade_ml_1s_m"].tolist() == [1.0, 2.0]
 
 

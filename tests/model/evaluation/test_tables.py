@@ -6,7 +6,8 @@ import pytest
 
 from model.evaluation.published import PUBLISHED
 from model.evaluation.results import Row
-from model.evaluation.tables import Table, markdown, tables
+from model.evaluation.tables import markdown, tables
+from model.evaluation.text_tables import Table
 from tests.model.evaluation.builders import results, row
 
 CAB = replace(

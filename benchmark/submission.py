@@ -1,0 +1,123 @@
+"""The nuScenes prediction challenge's submission, out of saved answers.
+
+A JSON list with one entry a pair, as nuscenes-devkit reads it (``eval/prediction/data_classes.py``). Its
+metrics rank the modes by probability, so entries are written such that it ranks them as
+``model.metrics.multimodal`` does, and finds the same figures.
+"""
+
+import json
+import uuid
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final, TypedDict
+
+import numpy as np
+
+from benchmark import BenchmarkError
+from benchmark.answers import SceneAnswers
+from benchmark.plan import PlannedScene
+from model.arrays import Bools, Floats
+from model.data.checks import FUTURE_STEPS
+from model.metrics.multimodal import by_probability
+
+MAX_MODES: Final = 25
+"""Of an entry; the devkit refuses more."""
+
+
+class Entry(TypedDict):
+    """The forecast of one pair."""
+
+    instance: str
+    sample: str
+    prediction: list[list[list[float]]]
+    """[modes][12][2], m, ground frame; the likeliest mode first."""
+    probabilities: list[float]
+    """[modes], strictly falling; their sum is 1."""
+
+
+def submission_entries(scene: PlannedScene, answers: SceneAnswers) -> list[Entry]:
+    """Entries of a scene, in the order of its pairs.
+
+    Of more than ``MAX_MODES`` modes the likeliest stay, and get the others' probability in proportion.
+
+    Args:
+        scene: what was asked.
+        answers: of one model.
+
+    Raises:
+        BenchmarkError: the data has no tokens, a pair has no forecast, or one that cannot be submitted.
+    """
+    where = scene.record.name
+    if not all(pair.token for pair in scene.pairs):
+        raise BenchmarkError(f"{where}: a submission needs data with tokens (nuscenes); this has none")
+    missing = sorted(set(range(len(scene.pairs))) - set(answers.instances.tolist()))
+    if missing:
+        raise BenchmarkError(
+            f"{where}: a submission needs a forecast of every pair; {len(missing)} of {len(scene.pairs)} "
+            f"have none, the first {scene.pairs[missing[0]].token}"
+        )
+    if answers.mixture is None:
+        return []
+    modes = answers.mixture.world_means.numpy()
+    probabilities = answers.mixture.weights.double().numpy()
+    if modes.shape[2] != FUTURE_STEPS:
+        raise BenchmarkError(
+            f"{where}: a submission needs forecasts of {FUTURE_STEPS} steps, not {modes.shape[2]}"
+        )
+    if not (np.isfinite(modes).all() and np.isfinite(probabilities).all()):
+        raise BenchmarkError(f"{where}: there are forecasts that are not finite")
+    order = by_probability(probabilities)
+    said = ~_padding(modes, probabilities)
+    entries = []
+    for row, pair in enumerate(scene.pairs):
+        kept = order[row][said[row][order[row]]][:MAX_MODES]
+        instance, _, sample = pair.token.partition("_")
+        entries.append(
+            Entry(
+                instance=instance,
+                sample=sample,
+                prediction=modes[row, kept].tolist(),
+                probabilities=_falling(probabilities[row, kept]).tolist(),
+            )
+        )
+    return entries
+
+
+def write_submission(entries: Iterable[Entry], file: Path) -> None:
+    """Writes a submission, one entry a line; a file of that name stays as it was until all is written.
+
+    Args:
+        entries: of all scenes; taken one by one, as all together may be large.
+        file: to write.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    new = file.with_name(f".{file.name}.{uuid.uuid4().hex[:12]}.new")
+    try:
+        with new.open("w", encoding="utf-8") as out:
+            out.write("[")
+            for number, entry in enumerate(entries):
+                out.write(("," if number else "") + "\n" + json.dumps(entry, allow_nan=False))
+            out.write("\n]\n")
+        new.replace(file)
+    finally:
+        new.unlink(missing_ok=True)
+
+
+def _padding(modes: Floats, probabilities: Floats) -> Bools:
+    """[N, K], modes that nobody said: ``read_answers`` repeats the first one, with no weight, where another
+    pair of the scene has more. The devkit's off-road rate would count each."""
+    again = (modes == modes[:, :1]).all(axis=(-2, -1))
+    again[:, 0] = False
+    padding: Bools = again & (probabilities == 0)
+    return padding
+
+
+def _falling(probabilities: Floats) -> Floats:
+    """Ranked probabilities [K] with the sum 1, and of equal ones each a rounding error above the next: the
+    devkit leaves ties among more than 16 modes to numpy's version and the processor."""
+    falling: Floats = probabilities / probabilities.sum()
+    for mode in range(len(falling) - 2, -1, -1):
+        falling[mode] = max(falling[mode], np.nextafter(falling[mode + 1], np.inf))
+    return falling

@@ -1,0 +1,206 @@
+"""Whole benchmarks against the real server."""
+
+import asyncio
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmark import BenchmarkError
+from benchmark.archive import Archive
+from benchmark.judge import Judged
+from benchmark.models import BASELINES, PHYSICS_ORACLE, choose
+from benchmark.replay import Replayed
+from benchmark.results import Results
+from benchmark.run import Benchmark, listed_models
+from benchmark.score import Judging
+from cab.forecast.v1.model_service_pb2 import Model
+from cab_forecast import AsyncClient
+from model.evaluation import subjects
+from model.evaluation.run import Evaluation
+from model.forecaster import Protocol
+from model.metrics.density import DRAWS
+from model.metrics.oracle import PHYSICS
+from service.server import Server
+from tests.benchmark.scenes import PAIRS, READER
+from tests.model.evaluation.builders import checkpoints
+from tests.service.servers import in_thread, settings
+
+SAMPLES = 20
+
+
+@pytest.fixture(scope="module")
+def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Checkpoints of random weights."""
+    return checkpoints(tmp_path_factory.mktemp("models"))
+
+
+@pytest.fixture(scope="module")
+def server(models: Path) -> Iterator[Server]:
+    """A server with them and the baselines."""
+    with in_thread(settings(models=models, allow_paper_protocol=True)) as running:
+        yield running
+
+
+def made(folder: Path, protocol: Protocol = Protocol.CAUSAL, limit: int | None = None) -> Benchmark:
+    """A benchmark on made-up scenes."""
+    judging = Judging(SAMPLES, DRAWS, 0, consistency=True)
+    return Benchmark("made", READER, "some", protocol, folder, judging, limit)
+
+
+def ask(whole: Benchmark, endpoint: str, *names: str) -> dict[str, Model]:
+    """Asks whatever has no answer yet; who was asked."""
+
+    async def go() -> dict[str, Model]:
+        async with AsyncClient(endpoint, timeout=30, retries=1000) as client:
+            chosen = choose(await listed_models(client), whole.protocol, names)
+            await whole.ask(client, endpoint, whole.replay(chosen, 4, 30), lambda done: None)
+            return chosen
+
+    return asyncio.run(go())
+
+
+def judge(whole: Benchmark, chosen: dict[str, Model], processes: int = 1) -> tuple[Results, Judged]:
+    """Judges what is saved."""
+    return whole.judge(chosen, processes, lambda pairs: None)
+
+
+def same(one: Results, other: Results) -> None:
+    """Everything is equal but what the clock told."""
+    for left, right in zip(one.models, other.models, strict=True):
+        assert left.key == right.key
+        np.testing.assert_equal(dict(left.metrics), dict(right.metrics))
+        assert (left.statuses, left.instants) == (right.statuses, right.instants)
+
+
+@pytest.mark.parametrize("protocol", Protocol)
+@pytest.mark.parametrize("transport", ["grpc", "http"])
+def test_online_equals_offline(
+    tmp_path: Path, server: Server, models: Path, protocol: Protocol, transport: str
+) -> None:
+    address = server.grpc_address if transport == "grpc" else server.http_address
+    whole = made(tmp_path, protocol)
+    chosen = ask(whole, f"{transport}://{address}")
+    results, _ = judge(whole, chosen)
+    assert results.missing == 0
+    assert {model.name for model in results.models} >= {*BASELINES, PHYSICS_ORACLE, "cab"}
+    offline = Evaluation(
+        subjects.choose(models, protocol), "made", READER, "some", protocol, tmp_path / "cache", SAMPLES
+    )(lambda *_: None, lambda _: None)
+    assert results.pairs == offline.pairs == PAIRS
+    rows = {f"{row.name}@{row.version}" if row.version else row.name: row for row in offline.rows}
+    assert {model.key for model in results.models} == set(rows)
+    for model in results.models:
+        for name, value in rows[model.key].metrics.items():
+            approx = pytest.approx(value, rel=1e-4, abs=1e-4, nan_ok=True)
+            assert model.metrics[name] == approx, (model.key, name)
+
+
+def test_what_a_run_tells(tmp_path: Path, server: Server) -> None:
+    whole = made(tmp_path)
+    results, judged = judge(whole, ask(whole, f"grpc://{server.grpc_address}"))
+    by_name = {model.name: model for model in results.models}
+    cab, kalman, oracle = by_name["cab"], by_name["kalman"], by_name[PHYSICS_ORACLE]
+    assert sum(cab.statuses.values()) == PAIRS
+    assert cab.statuses["SHORT_HISTORY"] > 0
+    assert (cab.protocol, kalman.protocol) == ("causal", "any")
+    assert cab.latency is not None
+    assert 0 < cab.latency.inference_p50_s < cab.latency.p50_s <= cab.latency.p99_s < 30
+    assert cab.latency.calls == sum(len(scene.calls) for scene in whole.scenes)
+    assert cab.instants == oracle.instants > 0
+    physics = [by_name[name].metrics["ade_ml_6s_m"] for name in PHYSICS]
+    assert oracle.metrics["ade_ml_6s_m"] < min(physics)
+    # The hardest are those that Kalman misses most
+    assert judged.mismatch_m is not None
+    assert kalman.metrics["fde_hardest_1_m"] == judged.mismatch_m.max()
+    assert kalman.metrics["fde_hardest_all_m"] == pytest.approx(kalman.metrics["fde_ml_6s_m"])
+    assert judged.each["cab@1.0.0/fde_ml_6s_m"].mean() == pytest.approx(cab.metrics["fde_ml_6s_m"])
+    cases = whole.hard_cases([cab.key], judged.mismatch_m)
+    assert cases[0].mismatch_m == judged.mismatch_m.max()
+    assert [case.mismatch_m for case in cases] == sorted((case.mismatch_m for case in cases), reverse=True)
+    assert len({(case.scene, case.agent) for case in cases}) == len(cases) == 6
+    np.testing.assert_array_equal(cases[0].history.shape[1], 2)
+
+
+def test_what_is_saved_gives_the_same_again(tmp_path: Path, server: Server) -> None:
+    whole = made(tmp_path)
+    results, _ = judge(whole, ask(whole, f"grpc://{server.grpc_address}"))
+    again = made(tmp_path)
+    same(results, judge(again, again.saved_models(), processes=2)[0])
+    some, _ = judge(again, again.saved_models(["kalman"]))
+    assert [model.key for model in some.models] == ["kalman@1.0.0"]
+
+
+def test_another_seed_draws_others(tmp_path: Path, server: Server) -> None:
+    whole = made(tmp_path)
+    chosen = ask(whole, f"grpc://{server.grpc_address}", "cab")
+    other = replace(whole, judging=replace(whole.judging, seed=1))
+    first, second = (judge(one, chosen)[0].models[0].metrics for one in (whole, other))
+    assert first["fde_ml_6s_m"] == second["fde_ml_6s_m"]
+    assert first["fde_f_6s_m"] != second["fde_f_6s_m"]
+
+
+def test_a_server_that_restarts_midway_loses_nothing(tmp_path: Path, models: Path) -> None:
+    whole = made(tmp_path)
+    halfway = threading.Event()
+
+    async def go(endpoint: str) -> tuple[dict[str, Model], Replayed]:
+        asked = 0
+
+        def tick(done: int) -> None:
+            nonlocal asked
+            asked += done
+            if asked > replay.forecasts() // 3:
+                halfway.set()
+
+        async with AsyncClient(endpoint, timeout=60, retries=1000) as client:
+            chosen = choose(await listed_models(client), whole.protocol)
+            replay = whole.replay(chosen, 4, 60)
+            return chosen, await whole.ask(client, endpoint, replay, tick)
+
+    with ThreadPoolExecutor(1) as pool:
+        with in_thread(settings(models=models)) as first:
+            address = first.grpc_address
+            asking = pool.submit(asyncio.run, go(f"grpc://{address}"))
+            assert halfway.wait(60)
+        assert not asking.done()  # or the test has shown nothing
+        with in_thread(settings(models=models, grpc=address)):
+            chosen, replayed = asking.result(120)
+    assert not replayed.refusals
+    results, _ = judge(whole, chosen)
+    assert results.missing == 0
+    assert all(sum(model.statuses.values()) == PAIRS for model in results.models if model.version)
+
+
+def test_answers_to_something_else_are_not_judged(tmp_path: Path, server: Server) -> None:
+    ask(made(tmp_path, limit=5), f"grpc://{server.grpc_address}", "kalman")
+    with pytest.raises(BenchmarkError, match="holds answers of another run: plan was"):
+        made(tmp_path).saved_models()
+    with pytest.raises(BenchmarkError, match="protocol was 'causal', is 'paper'"):
+        made(tmp_path, Protocol.PAPER, limit=5).saved_models()
+
+
+def test_an_instance_without_an_answer_is_missed(tmp_path: Path, server: Server) -> None:
+    whole = made(tmp_path)
+    chosen = ask(whole, f"grpc://{server.grpc_address}", "kalman", "cab")
+    lost = whole.scenes[1].calls[0]
+    with Archive(tmp_path) as archive:
+        archive._file.execute("DELETE FROM answers WHERE scene = 'scene-2' AND frame = ?", (lost.frame,))
+    results, _ = judge(whole, chosen)
+    assert results.missing == 2 * len(lost.due) > 0
+    assert results.models[0].statuses["MISSING"] == len(lost.due)
+    assert np.isfinite(results.models[0].metrics["fde_ml_6s_m"])
+
+
+def test_nobody_at_the_endpoint(tmp_path: Path) -> None:
+    with pytest.raises(BenchmarkError, match="does not answer"):
+        asyncio.run(_list("grpc://127.0.0.1:1"))
+
+
+async def _list(endpoint: str) -> list[Model]:
+    async with AsyncClient(endpoint, timeout=1, retries=0) as client:
+        return await listed_models(client)

@@ -1,0 +1,186 @@
+"""``cab-forecast benchmark`` as a user runs it, against a real server."""
+
+import json
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from benchmark.archive import FILE
+from model.data.sources import READERS, parse_data
+from service.cli.main import app
+from service.server import Server
+from tests.benchmark.scenes import PAIRS, RECORDS, write_nuscenes_pred
+from tests.service.servers import in_thread, settings
+
+MODELS = "kalman,constant-velocity-yaw"
+DEADLINE = 120.0
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A data set of the layout nuscenes_pred."""
+    return f"nuscenes_pred:{write_nuscenes_pred(tmp_path_factory.mktemp('data'))}"
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """A server with the baselines."""
+    with in_thread(settings(models=tmp_path_factory.mktemp("none"), default_model="kalman")) as running:
+        yield running
+
+
+def run(*arguments: str) -> tuple[int, str, str]:
+    """Exit code, standard output, standard error in one line."""
+    result = CliRunner().invoke(app, ["benchmark", *arguments])
+    return result.exit_code, result.stdout, " ".join(result.stderr.split())
+
+
+def results(folder: Path) -> dict[str, Any]:
+    """What was written, without what the clock told."""
+    read: dict[str, Any] = json.loads((folder / "results.json").read_text())
+    for model in read["models"]:
+        del model["latency"]
+    return read
+
+
+def test_the_tables_of_a_run_and_of_its_saved_answers(tmp_path: Path, data: str, server: Server) -> None:
+    out = tmp_path / "run"
+    asked = ("--endpoint", f"grpc://{server.grpc_address}", "--samples", "5", "--processes", "1")
+    code, shown, said = run("--data", data, "--out", str(out), *asked)
+    assert code == 0, said
+    for file in ("results.json", "tables.md", "report.html", "instances.npz", FILE):
+        assert (out / file).stat().st_size > 0, file
+    assert not list(out.glob("submission-*"))  # this data has no tokens
+    for text in ("physics-oracle", "kalman", "causal protocol, nuscenes_pred split train_val"):
+        assert text in shown
+        assert text in (out / "tables.md").read_text()
+    assert "asked for" in said
+    assert len(results(out)["models"]) == 6
+    # Again from what is saved, without an endpoint, into another folder
+    code, _, said = run(
+        "--data",
+        data,
+        "--from",
+        str(out),
+        "--out",
+        str(tmp_path / "again"),
+        "--samples",
+        "5",
+        "--processes",
+        "1",
+    )
+    assert code == 0, said
+    assert "asked for" not in said
+    assert results(tmp_path / "again") == results(out)
+    code, compared, said = run("compare", str(out), str(tmp_path / "again"))
+    assert code == 0, said
+    assert "kalman" in compared
+
+
+def test_a_run_that_was_killed_goes_on_to_the_same_result(tmp_path: Path, data: str, server: Server) -> None:
+    killed, whole = tmp_path / "killed", tmp_path / "whole"
+    arguments = ["--data", data, "--endpoint", f"http://{server.http_address}", "--samples", "5"]
+    arguments += ["--models", MODELS, "--processes", "1", "--concurrency", "1"]
+    command = [sys.executable, "-m", "service", "benchmark", *arguments, "--out", str(killed)]
+    first = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)  # noqa: S603
+    wanted = 2 * 10  # calls, of some 90
+    deadline = time.monotonic() + DEADLINE
+    while answered(killed) < wanted:
+        assert first.poll() is None, "it was through before it could be killed"
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    os.kill(first.pid, signal.SIGKILL)
+    assert first.wait() == -signal.SIGKILL
+    had = rows(killed)
+    assert wanted <= len(had)
+    assert not (killed / "results.json").exists()
+    assert run(*arguments, "--out", str(killed))[0] == 0
+    assert run(*arguments, "--out", str(whole))[0] == 0
+    after = rows(killed)
+    assert had.items() <= after.items()  # not asked again: the clock's reading is the old one
+    assert after.keys() == rows(whole).keys()
+    assert len(after) > len(had)
+    assert results(killed) == results(whole)
+
+
+def rows(folder: Path) -> dict[tuple[str, str, int], float]:
+    """Seconds of every saved answer."""
+    file = sqlite3.connect(folder / FILE)
+    try:
+        found = file.execute("SELECT model, scene, frame, seconds FROM answers").fetchall()
+    finally:
+        file.close()
+    return {(model, scene, frame): seconds for model, scene, frame, seconds in found}
+
+
+def answered(folder: Path) -> int:
+    """How many answers there are so far."""
+    try:
+        return len(rows(folder)) if (folder / FILE).exists() else 0
+    except sqlite3.OperationalError:  # its tables are about to be made
+        return 0
+
+
+def test_missing_forecasts_end_in_an_error(tmp_path: Path, data: str) -> None:
+    """A server that takes fewer agents than a frame has refuses such calls."""
+    tight = settings(models=tmp_path / "none", default_model="kalman", max_agents=3)
+    (tmp_path / "none").mkdir()
+    with in_thread(tight) as server:
+        code, shown, said = run(
+            *("--data", data, "--out", str(tmp_path / "run"), "--models", "kalman", "--samples", "0"),
+            *("--endpoint", f"grpc://{server.grpc_address}", "--processes", "1"),
+        )
+    assert code == 1
+    assert "forecasts are missing: the figures are of the others" in said
+    assert "refused: kalman@1.0.0, scene-1, frame" in said
+    assert "kalman" in shown
+    missing = results(tmp_path / "run")["models"][0]["statuses"]["MISSING"]
+    assert 0 < missing < PAIRS
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ((), "--data and --out are needed"),
+        (("--data", "nowhere", "--out", "{out}"), "data: 'nowhere' is not KIND:PATH"),
+        (("--data", "{data}", "--out", "{out}", "--models", " ,"), "models: it names nothing"),
+        (("--data", "{data}", "--out", "{out}", "--protocol", "best"), "no protocol 'best'"),
+        (("--data", "{data}", "--out", "{out}", "--split", "val"), "no split 'val'"),
+        (("--data", "{data}", "--out", "{out}", "--models", "fan"), "the endpoint has no model 'fan'"),
+        (("--data", "{data}", "--out", "{out}", "--endpoint", "127.0.0.1:1"), "the endpoint does not answer"),
+        (("--data", "{data}", "--from", "{empty}"), "there are no saved answers"),
+        (("compare", "{empty}", "{empty}"), "results.json"),
+    ],
+)
+def test_what_cannot_be_done_is_said(
+    tmp_path: Path, data: str, server: Server, arguments: tuple[str, ...], said: str
+) -> None:
+    (tmp_path / "empty").mkdir()
+    places = {"data": data, "out": str(tmp_path / "out"), "empty": str(tmp_path / "empty")}
+    given = [argument.format(**places) for argument in arguments]
+    if "--endpoint" not in given and given and given[0] != "compare":
+        given += ["--endpoint", f"grpc://{server.grpc_address}"]
+    if given and given[0] != "compare":
+        given += ["--timeout", "1"]
+    code, shown, errors = run(*given)
+    assert code == 1
+    assert said in errors
+    assert "Traceback" not in errors + shown
+
+
+def test_the_data_on_disk_is_the_one_in_memory(data: str) -> None:
+    """Of the vehicles: the layout has no others."""
+    kind, path = parse_data(data)
+    read = list(READERS[kind](path).scenes("train_val"))
+    assert [(one.name, len(one.pairs)) for one in read] == [(one.name, len(one.pairs)) for one in RECORDS]
+    assert (read[0].raster.layers == RECORDS[0].raster.layers).all()
+    assert (read[0].tracks[0].position == RECORDS[0].tracks[0].position).all()
