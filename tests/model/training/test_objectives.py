@@ -19,9 +19,16 @@ from model.networks import dynamics
 from model.networks.config import BlindContext, NetworkConfig
 from model.networks.network import AgentNetwork
 from model.scene import AgentType
-from model.training.elbo import LEAST_KL, clamped_divergence, log_likelihood, mutual_information
-from model.training.objectives import OBJECTIVES, Weights
+from model.training.elbo import (
+    LEAST_KL,
+    clamped_divergence,
+    expected_displacement,
+    log_likelihood,
+    mutual_information,
+)
+from model.training.objectives import OBJECTIVES, Loss, Weights
 from tests.model.networks.golden import golden_features
+from tests.model.training.fakes import MadeUpPairs
 
 METHODS = {
     "trajectron": BlindContext.NONE,
@@ -174,3 +181,46 @@ def test_log_likelihood_is_clamped_step_by_step() -> None:
     assert log_likelihood(weight, density, -6.0, 6.0).item() == pytest.approx(6 - 6 + 1)
     assert log_likelihood(weight, density, None, 6.0).item() == pytest.approx(6 - 100 + 1)
     assert log_likelihood(weight, density, None, None).item() == pytest.approx(1)
+
+
+def test_expected_displacement_by_hand() -> None:
+    """Two modes of probabilities 1/4 and 3/4, off by 1 m and 2 m, and by 0 and 4 m."""
+    log_prior = torch.tensor([[0.25, 0.75]]).log()
+    displacement = torch.tensor([[[1.0, 2.0], [0.0, 4.0]]])
+    assert expected_displacement(log_prior, displacement).tolist() == [pytest.approx(0.25 * 3 + 0.75 * 4)]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_displacement_counts_as_much_as_it_weighs(method: str) -> None:
+    """In every context that the method has."""
+    torch.manual_seed(0)
+    network = AgentNetwork(NetworkConfig(blind=METHODS[method], modes=3), AgentType.VEHICLE).eval()
+    source = MadeUpPairs(6)
+    given, future = source.batch(torch.arange(6))
+
+    def loss(weight: float) -> Loss:
+        weights = Weights(1.0, 5.0, sample_controls=False, displacement=weight)
+        return OBJECTIVES[method](network, given, future, weights)
+
+    without, light, heavy = loss(0.0), loss(1.0), loss(2.5)
+    assert not [name for name in without.terms if name.startswith("displacement")]
+    added = sum(term for name, term in light.terms.items() if name.startswith("displacement"))
+    assert added > 1.0
+    torch.testing.assert_close(light.value, without.value + added)
+    torch.testing.assert_close(heavy.value, without.value + 2.5 * added)
+    heavy.value.backward()
+    assert network.prior_logits.weight.grad is not None
+    assert network.prior_logits.weight.grad.norm() > 0
+
+
+def test_cab_presses_full_and_blind_apart_as_much_as_it_weighs() -> None:
+    torch.manual_seed(0)
+    network = AgentNetwork(NetworkConfig(blind=BlindContext.NULL, modes=3), AgentType.VEHICLE).eval()
+    given, future = MadeUpPairs(6).batch(torch.arange(6))
+    released, light = (
+        OBJECTIVES["cab"](network, given, future, Weights(1.0, 5.0, sample_controls=False, **weight))
+        for weight in ({}, {"apart": 0.5})
+    )
+    apart = released.terms["kl_full_blind"]
+    assert apart > 0
+    torch.testing.assert_close(light.value - released.value, 4.5 * apart)
