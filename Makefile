@@ -2,13 +2,14 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+NUSCENES := .venv-nuscenes
 BUF := npm exec --yes --package=@bufbuild/buf@1.75.0 -- buf
 # For example PIP_FLAGS="--extra-index-url https://download.pytorch.org/whl/cpu" for the CPU build of torch.
 PIP_FLAGS ?=
 PROTOC := PATH="$(CURDIR)/$(BIN):$$PATH" python -m grpc_tools.protoc
 PROTOS := $(wildcard proto/cab/forecast/v1/*.proto)
 
-.PHONY: install run test bench lint format proto proto-check proto-lint lock clean
+.PHONY: install run test test-nuscenes bench lint format proto proto-check proto-lint lock clean
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -22,6 +23,18 @@ run: install  ## serve on 127.0.0.1:8080 (REST) and :50051 (gRPC); print one for
 
 test: install lint proto-check  ## lint, types, drift of the generated code, all tests
 	$(BIN)/python -m pytest
+
+# nuscenes-devkit needs numpy < 2, so it has an environment of its own, with all other pins.
+$(NUSCENES)/.installed: pyproject.toml constraints.txt
+	test -x $(NUSCENES)/bin/python || $(PYTHON) -m venv $(NUSCENES)
+	grep -v '^numpy==' constraints.txt > $(NUSCENES)/constraints.txt
+	$(NUSCENES)/bin/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) \
+	  -c $(NUSCENES)/constraints.txt -e ".[benchmark,dev]"
+	touch $@
+
+test-nuscenes: $(NUSCENES)/.installed  ## tests that need nuscenes-devkit, in .venv-nuscenes
+	$(NUSCENES)/bin/python -m pytest tests/model/data/test_nuscenes.py tests/model/metrics/test_devkit.py \
+	  tests/benchmark/test_submission.py tests/benchmark/test_official.py
 
 lint: install
 	$(BIN)/ruff check .
@@ -53,4 +66,4 @@ lock: install  ## write constraints.txt anew from what is installed
 	$(BIN)/python -m pip freeze --exclude-editable | sed 's/+cpu$$//' > constraints.txt
 
 clean:
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(NUSCENES) .pytest_cache .mypy_cache .ruff_cache .hypothesis

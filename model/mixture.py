@@ -70,8 +70,19 @@ class TrajectoryMixture:
         Args:
             positions: [N, T, 2] float64, m, ground frame.
         """
-        joint = self.log_weights[:, :, None] + self.component_log_density(positions)
-        return torch.logsumexp(joint, dim=1)
+        return self.log_densities(positions[:, None])[:, 0]
+
+    def log_densities(self, positions: Tensor) -> Tensor:
+        """``log_density`` of S trajectories an agent: [N, S, T].
+
+        Args:
+            positions: [N, S, T, 2] float64, m, ground frame.
+        """
+        relative = (positions - self.origin[:, None, None, :]).to(self.means.dtype)
+        offset = relative[:, :, None] - self.means[:, None]
+        # Of the covariances nothing is computed S times over
+        joint = self.log_weights[:, None, :, None] + guarded_log_density(offset, self.covariances[:, None])
+        return torch.logsumexp(joint, dim=2)
 
     def moments(self) -> tuple[Tensor, Tensor]:
         """Mean [N, T, 2] (float64, ground frame) and covariance [N, T, 2, 2] of the whole mixture."""

@@ -116,9 +116,7 @@ def density_rank(
     chunk = max(1, _CHUNK_ELEMENTS // (draws * wide.means[0, :, :, 0].numel()))
     for start in range(0, len(wide), chunk):
         part = wide[start : start + chunk]
-        drawn = part.sample(draws, seeds[start : start + chunk]).flatten(0, 1)
-        each = torch.arange(len(part)).repeat_interleave(draws)
-        density = part[each].log_density(drawn).unflatten(0, (-1, draws))
+        density = part.log_densities(part.sample(draws, seeds[start : start + chunk]))
         denser[start : start + chunk] = (density > at_truth[start : start + chunk, None]).sum(dim=1)
     rank = (denser + 0.5) / (draws + 1)
     return _numpy(torch.where(at_truth.isnan(), torch.nan, rank))

@@ -25,9 +25,7 @@ def benchmark(
     data: Annotated[str | None, typer.Option(help="KIND:PATH of the data, e.g. nuscenes_pred:DIR")] = None,
     out: Annotated[
         Path | None,
-        typer.Option(
-            file_okay=False, help="Folder for answers and report; an interrupted run goes on."
-        ),
+        typer.Option(file_okay=False, help="Folder for answers and report; an interrupted run goes on."),
     ] = None,
     *,
     endpoint: Annotated[

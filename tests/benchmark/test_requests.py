@@ -37,6 +37,7 @@ def test_the_server_reads_the_states_that_training_sees(protocol: Protocol) -> N
     sent, _ = request(protocol)
     scene, _ = SceneFrames(planned()[0].record, protocol, 5).at(FRAME)
     read = read_agents(sent, Settings())
+    assert read.observations is not None
     states: AgentStates = resample(read.observations, sent.time, 5)
     for field in FIELDS:
         np.testing.assert_allclose(getattr(states, field), getattr(scene.states, field), atol=1e-9)

@@ -54,10 +54,10 @@ def test_every_method_learns(tmp_path: Path, method: Method) -> None:
 
 @pytest.mark.parametrize("method", [Method.CAB, Method.COVERNET, Method.HALENTNET])
 def test_a_run_in_two_parts_is_the_same_as_in_one(tmp_path: Path, method: Method) -> None:
-    whole, _ = train(small_config(method, epochs=4), tmp_path / "whole")
-    train(small_config(method, epochs=2), tmp_path / "parts")
-    parts, reports = train(small_config(method, epochs=4), tmp_path / "parts")
-    assert len(reports) == 2
+    whole, _ = train(small_config(method, epochs=2), tmp_path / "whole")
+    train(small_config(method, epochs=1), tmp_path / "parts")
+    parts, reports = train(small_config(method, epochs=2), tmp_path / "parts")
+    assert len(reports) == 1
     assert parts.progress.step == whole.progress.step
     assert parts.progress.best_score == whole.progress.best_score
     for module, networks in whole.learner.modules().items():
