@@ -115,7 +115,7 @@ _BY_CODE: dict[str, type[ForecastError]] = {
     "RESOURCE_EXHAUSTED": Overloaded,
     "DEADLINE_EXCEEDED": DeadlineExceeded,
     "UNAVAILABLE": Unavailable,
-    # A gRPC server that stops so ends calls which it has not yet begun; the client's own cancelling is no error
+    # So a gRPC server that stops ends calls that it has not begun; a client's own cancelling is no error
     "CANCELLED": Unavailable,
     "INTERNAL": InternalError,
     "DATA_LOSS": InternalError,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmark.submission import submission_entries, write_submission
-from benchmark.tables import markdown, tables
+from benchmark.tables import left_out, markdown, tables
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import (
@@ -88,6 +88,8 @@ def show_benchmark(
     (out / TABLES_FILE).write_text(markdown(results), encoding="utf-8")
     written = [*_submissions(whole, models, out), _page(whole, results, judged.mismatch_m, out, console)]
     show_tables(tables(results), out)
+    for why in left_out(results):
+        Console().print(f"[dim]{escape(why)}[/]", highlight=False)
     for file in written:
         if file is not None:
             Console().print(f"  {escape(str(file))}", highlight=False)
