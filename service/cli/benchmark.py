@@ -102,10 +102,9 @@ def compare(
     second: Annotated[Path, typer.Argument(metavar="B", help="Folder of another one's.")],
 ) -> None:
     """Sets the figures of two runs side by side."""
+    from benchmark import BenchmarkError  # noqa: PLC0415
     from benchmark.compare import compare as compared  # noqa: PLC0415
     from benchmark.compare import markdown  # noqa: PLC0415
-
-    from benchmark import BenchmarkError  # noqa: PLC0415
 
     try:
         typer.echo(markdown(compared(first, second)), nl=False)

@@ -5,8 +5,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmark.submission import submission_entries, write_submission
-from benchmark.tables import left_out, markdown, tables
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import (
@@ -28,6 +26,8 @@ from benchmark.models import choose
 from benchmark.replay import RETRIES, Refusal
 from benchmark.results import Results, write_instances
 from benchmark.run import Benchmark, listed_models, with_refusals
+from benchmark.submission import submission_entries, write_submission
+from benchmark.tables import left_out, markdown, tables
 from cab.forecast.v1.model_service_pb2 import Model
 from cab_forecast import AsyncClient
 from model.arrays import Floats
