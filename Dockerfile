@@ -6,6 +6,7 @@ COPY proto proto
 COPY model model
 COPY service service
 COPY cab_forecast cab_forecast
+COPY benchmark benchmark
 # The CPU build of torch: the default one brings gigabytes of CUDA
 RUN python -m venv /opt/cab-forecast \
  && /opt/cab-forecast/bin/pip install --no-cache-dir --disable-pip-version-check \

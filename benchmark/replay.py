@@ -46,7 +46,7 @@ class Replay:
     models: Mapping[str, Model]
     """By ``name@version``."""
     protocol: Protocol
-    concurrency: int = 8
+    concurrency: int = 16
     """Calls on their way at once."""
     timeout: float = 60.0
     """s for a call with its retries: also how long a lost server is waited for."""

@@ -55,7 +55,7 @@ def benchmark(
     ] = True,
     limit: Annotated[int | None, typer.Option(min=1, help="Only so many of the first pairs.")] = None,
     seed: Annotated[int, typer.Option(min=0, max=2000, help="Of all that is drawn.")] = 0,
-    concurrency: Annotated[int, typer.Option(min=1, help="Calls on their way at once.")] = 8,
+    concurrency: Annotated[int, typer.Option(min=1, help="Calls on their way at once.")] = 16,
     timeout: Annotated[
         float,
         typer.Option(
