@@ -1,16 +1,18 @@
 """Saved answers of one scene as arrays, in the order of what was asked."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
+from benchmark import BenchmarkError
 from benchmark.archive import Answer, Archive
-from benchmark.plan import PlannedScene
+from benchmark.plan import PlannedScene, full_history
 from cab_forecast import Forecast, forecasts
 from model.arrays import Floats, Ints
+from model.data.scenes import Track
 from model.mixture import TrajectoryMixture
 
 MISSING = "MISSING"
@@ -41,9 +43,11 @@ class SceneAnswers:
     """Of these; None: there are none."""
     statuses: Mapping[str, int]
     """How many pairs came out how."""
+    lost: int
+    """Forecasts that were asked for dispersion and convergence alone, and did not come."""
     likeliest: Mapping[int, tuple[Ints, Floats]]
-    """By track: frames [F], ascending, and the most likely trajectories [F, T, 2] that were made there, m,
-    ground frame."""
+    """By track: frames [F] at which it has a full history, ascending, and the most likely trajectories
+    [F, T, 2] that were made there, m, ground frame."""
     times: CallTimes
 
 
@@ -56,14 +60,24 @@ def read_answers(archive: Archive, model: str, scene: PlannedScene) -> SceneAnsw
         scene: what was asked.
 
     Raises:
-        ValueError: an answer contradicts itself.
+        BenchmarkError: an answer contradicts itself, or what was asked.
     """
+    try:
+        return _read(archive, model, scene)
+    except (ValueError, KeyError, IndexError) as error:
+        where = f"{model}, {scene.record.name}"
+        raise BenchmarkError(f"{where}: an answer does not fit what was asked: {error!r}") from error
+
+
+def _read(archive: Archive, model: str, scene: PlannedScene) -> SceneAnswers:
     tracks = {track.id: number for number, track in enumerate(scene.record.tracks)}
     numbers = {(pair.track, pair.frame): number for number, pair in enumerate(scene.pairs)}
     calls = {call.frame: call for call in scene.calls}
+    full = {number: set(full_history(track.frames).tolist()) for track, number in _numbered(scene)}
     found: dict[int, Forecast] = {}
     paths: dict[int, list[tuple[int, Floats]]] = {}
     statuses: Counter[str] = Counter()
+    others = 0
     answers: list[Answer] = []
     for frame, answer in archive.answers(model, scene.record.name):
         answers.append(answer)
@@ -76,7 +90,9 @@ def read_answers(archive: Archive, model: str, scene: PlannedScene) -> SceneAnsw
                 statuses[forecast.status.value] += 1
             if not len(forecast.weights):
                 continue
-            paths.setdefault(track, []).append((frame, forecast.most_likely))
+            if frame in full[track]:
+                paths.setdefault(track, []).append((frame, forecast.most_likely))
+            others += not due
             if due:
                 found[numbers[track, frame]] = forecast
     statuses[MISSING] = len(scene.pairs) - sum(statuses.values())
@@ -86,9 +102,16 @@ def read_answers(archive: Archive, model: str, scene: PlannedScene) -> SceneAnsw
         instances,
         mixture,
         {status: count for status, count in statuses.items() if count},
+        scene.forecasts - len(scene.pairs) - others,
         {track: _in_order(made) for track, made in paths.items()},
         _times(answers),
     )
+
+
+def _numbered(scene: PlannedScene) -> Iterator[tuple[Track, int]]:
+    """Tracks that are asked for, with their numbers."""
+    for number in {track for call in scene.calls for track in call.tracks}:
+        yield scene.record.tracks[number], number
 
 
 def _in_order(made: Sequence[tuple[int, Floats]]) -> tuple[Ints, Floats]:

@@ -27,7 +27,21 @@ CREATE TABLE IF NOT EXISTS answers (
     model TEXT NOT NULL, scene TEXT NOT NULL, frame INTEGER NOT NULL, seconds REAL NOT NULL,
     response BLOB NOT NULL, PRIMARY KEY (model, scene, frame)
 );
+CREATE TABLE IF NOT EXISTS refusals (
+    model TEXT NOT NULL, scene TEXT NOT NULL, frame INTEGER NOT NULL, why TEXT NOT NULL,
+    PRIMARY KEY (model, scene, frame)
+);
 """
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A call that the endpoint would not answer."""
+
+    model: str
+    scene: str
+    frame: int
+    why: str
 
 
 @dataclass(frozen=True)
@@ -44,26 +58,45 @@ class Archive:
 
     Args:
         folder: of the run; made where it does not exist.
-        read_only: whether there must be answers already.
+        read_only: whether there must be answers already; nothing is then written.
 
     Raises:
         BenchmarkError: it cannot be opened, or there is nothing to read.
     """
 
     def __init__(self, folder: Path, read_only: bool = False) -> None:
-        file = folder / FILE
-        if read_only and not file.is_file():
-            raise BenchmarkError(f"{file}: there are no saved answers")
+        self._path = folder / FILE
+        if read_only and not self._path.is_file():
+            raise BenchmarkError(f"{self._path}: there are no saved answers")
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            self._file = sqlite3.connect(file, isolation_level=None)
-            # A commit then waits for no disk: a killed process loses nothing, a power cut the last answers
-            self._file.execute("PRAGMA journal_mode = WAL")
-            self._file.execute("PRAGMA synchronous = NORMAL")
-            self._file.executescript(_TABLES)
+            self._file = self._open_to_read() if read_only else self._open_to_write(folder)
         except (OSError, sqlite3.Error) as error:
-            raise BenchmarkError(f"{file}: cannot be used for answers: {error}") from error
-        self._path = file
+            raise BenchmarkError(f"{self._path}: cannot be used for answers: {error}") from error
+
+    def _open_to_read(self) -> sqlite3.Connection:
+        # Without a log beside it nobody writes to it, and then it may lie where not even SQLite can write
+        settled = not self._path.with_name(f"{FILE}-wal").exists()
+        how = "mode=ro&immutable=1" if settled else "mode=ro"
+        file = sqlite3.connect(f"{self._path.resolve().as_uri()}?{how}", uri=True)
+        try:
+            file.execute("SELECT model FROM answers LIMIT 1")
+        except sqlite3.Error:
+            file.close()
+            raise
+        return file
+
+    def _open_to_write(self, folder: Path) -> sqlite3.Connection:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = sqlite3.connect(self._path, isolation_level=None)
+        try:
+            # A commit then waits for no disk: a killed process loses nothing, a power cut the last answers
+            file.execute("PRAGMA journal_mode = WAL")
+            file.execute("PRAGMA synchronous = NORMAL")
+            file.executescript(_TABLES)
+        except sqlite3.Error:
+            file.close()
+            raise
+        return file
 
     def __enter__(self) -> Self:
         return self
@@ -77,19 +110,27 @@ class Archive:
         """Ends its use."""
         self._file.close()
 
-    def bind(self, facts: Mapping[str, str]) -> None:
-        """Ties the archive to what is asked.
+    def check(self, facts: Mapping[str, str]) -> None:
+        """Whether its answers are to what is asked.
 
         Raises:
-            BenchmarkError: it holds answers to something else; names what differs.
+            BenchmarkError: they are to something else; names what differs.
         """
         known = self.facts()
         for name, value in facts.items():
             if known.get(name, value) != value:
                 raise BenchmarkError(
-                    f"{self._path}: holds answers of another run: {name} was {known[name]!r}, is {value!r}; "
-                    "give another folder"
+                    f"{self._path}: holds answers of another run: {name} was {known[name]}, is {value}; "
+                    "give the same options, or another folder"
                 )
+
+    def bind(self, facts: Mapping[str, str]) -> None:
+        """Ties the archive to what is asked.
+
+        Raises:
+            BenchmarkError: as ``check``.
+        """
+        self.check(facts)
         self._file.executemany("INSERT OR REPLACE INTO run VALUES (?, ?)", facts.items())
 
     def note(self, name: str, value: str) -> None:
@@ -103,8 +144,10 @@ class Archive:
     def register(self, key: str, model: Model) -> None:
         """Notes a model whose answers will come.
 
+        Its description is compared, which is all that a client knows of its weights.
+
         Raises:
-            BenchmarkError: answers of another model under that name are here.
+            BenchmarkError: answers of a model of another description are here under that name.
         """
         known = self.models().get(key)
         if known is not None and not _same(known, model):
@@ -127,9 +170,20 @@ class Archive:
         return set(self._file.execute("SELECT model, scene, frame FROM answers"))
 
     def add(self, model: str, scene: str, call: Call, answer: Answer) -> None:
-        """Keeps an answer."""
+        """Keeps an answer; a refusal of the same call is forgotten."""
         row = (model, scene, call.frame, answer.seconds, answer.response.SerializeToString())
         self._file.execute("INSERT OR REPLACE INTO answers VALUES (?, ?, ?, ?, ?)", row)
+        self._file.execute("DELETE FROM refusals WHERE model = ? AND scene = ? AND frame = ?", row[:3])
+
+    def refuse(self, model: str, scene: str, call: Call, why: str) -> None:
+        """Keeps that a call was refused."""
+        row = (model, scene, call.frame, why)
+        self._file.execute("INSERT OR REPLACE INTO refusals VALUES (?, ?, ?, ?)", row)
+
+    def refusals(self) -> list[Refusal]:
+        """Calls that were refused and have no answer since."""
+        rows = self._file.execute("SELECT model, scene, frame, why FROM refusals ORDER BY rowid")
+        return [Refusal(*row) for row in rows]
 
     def answers(self, model: str, scene: str) -> Iterator[tuple[int, Answer]]:
         """Frame and answer of every call about a scene, by frame."""
@@ -143,8 +197,9 @@ class Archive:
 
 
 def _same(known: Model, model: Model) -> bool:
-    """Whether two descriptions are of the same weights; which one is the default does not matter."""
+    """Whether two descriptions are of the same model; words and figures about it may be mended."""
     plain = [Model.FromString(one.SerializeToString()) for one in (known, model)]
     for one in plain:
-        one.is_default = False
+        for field in ("is_default", "description", "benchmark", "license"):
+            one.ClearField(field)
     return plain[0] == plain[1]

@@ -27,7 +27,19 @@ KEY_FIGURES = {
 CLEAR = 2.0
 """Standard errors that a difference must exceed to be called clear."""
 
-_SETTINGS = ("protocol", "data", "split", "pairs", "limit", "consistency", "samples", "draws", "seed", "plan")
+_SETTINGS = (
+    "protocol",
+    "data",
+    "split",
+    "pairs",
+    "limit",
+    "consistency",
+    "samples",
+    "draws",
+    "seed",
+    "plan",
+    "concurrency",
+)
 _DIGEST_SHOWN = 12
 
 

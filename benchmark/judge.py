@@ -4,15 +4,17 @@ import multiprocessing
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+from benchmark import BenchmarkError
 from benchmark.answers import CallTimes
 from benchmark.consistency import METRICS
 from benchmark.hard import hardest_fde
-from benchmark.models import KALMAN, PHYSICS_ORACLE, learned, protocol_of
+from benchmark.models import KALMAN, PHYSICS_ORACLE, learned, oldest_first, protocol_of
 from benchmark.plan import PlannedScene
 from benchmark.results import PER_INSTANCE, Latency, ModelResult
 from benchmark.score import Judging, SceneScore, judge_scene
@@ -31,6 +33,7 @@ class _Sums:
     means: MetricMeans = field(default_factory=MetricMeans)
     instants: MetricMeans = field(default_factory=MetricMeans)
     statuses: Counter[str] = field(default_factory=Counter)
+    lost: int = 0
     times: list[CallTimes] = field(default_factory=list)
     each: dict[str, Floats] = field(default_factory=dict)
 
@@ -38,6 +41,7 @@ class _Sums:
         self.means.add(score.metrics)
         self.instants.add(score.instants)
         self.statuses.update(score.statuses)
+        self.lost += score.lost
         if score.times is not None:
             self.times.append(score.times)
         for name in PER_INSTANCE:
@@ -84,7 +88,8 @@ def judge(
         for key, score in scores.items():
             sums.setdefault(key, _Sums(pairs)).add(score)
         tick(len(scene.pairs))
-    kalman = [known.each[_FDE] for key, known in sums.items() if _is_kalman(key) and _FDE in known.each]
+    ranking = [key for key in oldest_first(models) if _is_kalman(key)]
+    kalman = [sums[key].each[_FDE] for key in ranking if _FDE in sums[key].each]
     mismatch_m = kalman[-1] if kalman else None
     each = {f"{key}/{name}": values for key, known in sums.items() for name, values in known.each.items()}
     results = tuple(_result(key, models.get(key), known, mismatch_m) for key, known in sums.items())
@@ -100,13 +105,15 @@ def _scores(
         return
     # Spawned: a fork would copy threads of torch and gRPC in whatever state they are
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(processes, mp_context=context) as pool:
+    with ProcessPoolExecutor(min(processes, len(scenes)), mp_context=context) as pool:
         # The longest first, so that no process is left with one at the end
         ordered = sorted(scenes, key=lambda scene: -scene.forecasts)
         work = {pool.submit(judge_scene, folder, scene, models, judging): scene for scene in ordered}
         try:
             for done in as_completed(work):
                 yield work[done], done.result()
+        except BrokenProcessPool as error:
+            raise BenchmarkError(f"a judging process died, for want of memory? {error}") from error
         finally:
             pool.shutdown(cancel_futures=True)
 
@@ -126,6 +133,7 @@ def _result(key: str, model: Model | None, known: _Sums, mismatch_m: Floats | No
         dict(sorted(known.statuses.items())),
         metrics,
         instants,
+        known.lost,
         _latency(known.times),
     )
 

@@ -66,7 +66,7 @@ def plan_scenes(
     Args:
         reader: of the data.
         split: one of the reader's.
-        consistency: also ask for every agent of the challenge at every frame at which it has a full history.
+        consistency: also ask for every agent that has pairs, at every frame at which it has a full history.
         limit: how many of the first pairs; None: all.
 
     Raises:
@@ -93,7 +93,9 @@ def digest(scenes: Sequence[PlannedScene]) -> str:
             whole.update(repr((track.id, track.type.value)).encode())
             for values in (track.frames, track.position, track.heading):
                 whole.update(np.ascontiguousarray(values).tobytes())
-        whole.update(np.packbits(scene.record.raster.layers).tobytes())
+        raster = scene.record.raster
+        whole.update(repr((raster.layers.shape, raster.origin.tolist(), raster.pixels_per_meter)).encode())
+        whole.update(np.packbits(raster.layers).tobytes())
     return whole.hexdigest()
 
 

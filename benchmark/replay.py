@@ -3,7 +3,7 @@
 import asyncio
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from benchmark import BenchmarkError
 from benchmark.archive import Answer, Archive
@@ -11,21 +11,23 @@ from benchmark.plan import Call, PlannedScene
 from benchmark.requests import SceneRequests
 from cab.forecast.v1.model_service_pb2 import Model
 from cab.forecast.v1.prediction_service_pb2 import PredictRequest, PredictResponse
-from cab_forecast import AsyncClient, BadRequest, ForecastError, TooLarge
+from cab_forecast import (
+    AsyncClient,
+    BadRequest,
+    DeadlineExceeded,
+    ForecastError,
+    InternalError,
+    Overloaded,
+    TooLarge,
+    Unavailable,
+)
+from cab_forecast.timing import Budget
 from model.forecaster import Protocol
 
 RETRIES = 10_000
 """Of a call: its timeout ends them."""
-
-
-@dataclass(frozen=True)
-class Refusal:
-    """A call that the endpoint will not answer."""
-
-    model: str
-    scene: str
-    frame: int
-    why: str
+MOST_REFUSED = 100
+"""Calls in a row; an endpoint that refuses so many will refuse the others, too."""
 
 
 @dataclass
@@ -35,7 +37,10 @@ class Replayed:
     asked: int = 0
     """Forecasts that were asked for now; what was in the archive is not asked again."""
     seconds: float = 0.0
-    refusals: list[Refusal] = field(default_factory=list)
+    refused: int = 0
+    """Calls that the endpoint would not answer."""
+    in_a_row: int = 0
+    """Refused calls since the last answer."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +63,9 @@ class Replay:
     async def run(self, client: AsyncClient, archive: Archive, tick: Callable[[int], None]) -> Replayed:
         """Asks whatever has no answer yet.
 
-        Overload and lost connections are waited out by the client. A request that the endpoint refuses for
-        what it says is noted; anything else ends the replay, with all answers kept.
+        Overload, late answers and lost connections are waited out. A call that the endpoint refuses or fails
+        at is noted, and the next one made; many such in a row, and anything else, end the replay, with all
+        answers kept.
 
         Args:
             client: of the endpoint.
@@ -67,7 +73,7 @@ class Replay:
             tick: told of every call how many forecasts it brought; first of what is there already.
 
         Raises:
-            BenchmarkError: the endpoint does not answer.
+            BenchmarkError: the endpoint does not answer, or refuses everything.
         """
         done = archive.answered()
         replayed = Replayed()
@@ -80,10 +86,12 @@ class Replay:
         ]
         try:
             await asyncio.gather(*senders)
-        except ForecastError as error:
+        except (Unavailable, Overloaded, DeadlineExceeded) as error:
             raise BenchmarkError(
                 f"the endpoint does not answer: {error}; answers so far are kept, run again to go on"
             ) from error
+        except ForecastError as error:
+            raise BenchmarkError(f"the endpoint refuses: {error}; answers so far are kept") from error
         finally:
             for sender in senders:
                 sender.cancel()
@@ -102,15 +110,30 @@ class Replay:
         for model, scene, call, request in work:
             started = time.perf_counter()
             try:
-                response = await client.predict(request, timeout=self.timeout)
-            except (BadRequest, TooLarge) as error:
-                replayed.refusals.append(Refusal(model, scene.record.name, call.frame, str(error)))
+                response = await self._predict(client, request)
+            except (BadRequest, TooLarge, InternalError) as error:
+                archive.refuse(model, scene.record.name, call, str(error))
+                replayed.refused += 1
+                replayed.in_a_row += 1
+                if replayed.in_a_row >= MOST_REFUSED:
+                    raise
             else:
+                replayed.in_a_row = 0
                 seconds = time.perf_counter() - started
                 keep_the_likeliest(response, call, scene)
                 archive.add(model, scene.record.name, call, Answer(seconds, response))
             replayed.asked += len(call.tracks)
             tick(len(call.tracks))
+
+    async def _predict(self, client: AsyncClient, request: PredictRequest) -> PredictResponse:
+        """One call. A server has bounds of its own for how long it takes: what it says is late is asked again
+        while there is time."""
+        budget = Budget(self.timeout)
+        while True:
+            try:
+                return await client.predict(request, timeout=budget.remaining())
+            except DeadlineExceeded:
+                budget.remaining()  # raises when none is left
 
     def _work(
         self, done: set[tuple[str, str, int]], tick: Callable[[int], None]

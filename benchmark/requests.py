@@ -49,7 +49,7 @@ class SceneRequests:
         return predict_request(
             time=call.frame * STEP_SECONDS,
             agents=agents,
-            raster=crop(self._scene.record.raster, around) if len(around) else None,
+            raster=crop(self._scene.record.raster, around),
         )
 
     def _agent(self, observations: Observations, row: int, track: int, predict: bool) -> Agent:
@@ -68,8 +68,11 @@ class SceneRequests:
         )
 
 
-def crop(raster: Raster, around: Floats) -> SceneRaster | None:
-    """The part of a map that some agents can see, on the same pixels; None: it is not on the map.
+def crop(raster: Raster, around: Floats) -> SceneRaster:
+    """The part of a map that some agents can see, on the same pixels.
+
+    Off the map it is one empty pixel: beyond its edge nothing is driveable, while of no map at all a model
+    would know nothing.
 
     Args:
         raster: of the scene.
@@ -81,5 +84,5 @@ def crop(raster: Raster, around: Floats) -> SceneRaster | None:
     high = np.ceil((around.max(axis=0) + REACH_M - raster.origin) * scale).clip(0, size).astype(int)
     part = raster.layers[:, low[0] : high[0], low[1] : high[1]]
     if not part.size:
-        return None
+        part = np.zeros((len(part), 1, 1), dtype=np.uint8)
     return scene_raster(part != 0, (raster.origin + low / scale).tolist(), scale)

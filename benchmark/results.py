@@ -6,11 +6,13 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from benchmark import BenchmarkError
+from benchmark.files import replacing
 from model.arrays import Floats
 from model.evaluation.results import finite
 from model.forecaster import Protocol
@@ -64,6 +66,8 @@ class ModelResult:
     ``fde_hardest_all_m``; NaN where unknown."""
     instants: int = 0
     """Over how many the means of dispersion and convergence are."""
+    lost: int = 0
+    """Forecasts that were asked for dispersion and convergence alone, and did not come."""
     latency: Latency | None = None
 
     @property
@@ -73,8 +77,13 @@ class ModelResult:
 
     @property
     def missing(self) -> int:
-        """Pairs without a forecast."""
-        return self.statuses.get("MISSING", 0) + self.statuses.get("INVALID", 0)
+        """Forecasts that did not come."""
+        return self.statuses.get("MISSING", 0) + self.statuses.get("INVALID", 0) + self.lost
+
+    @property
+    def fallbacks(self) -> int:
+        """Pairs whose forecast another model made."""
+        return self.statuses.get("FALLBACK", 0)
 
 
 @dataclass(frozen=True)
@@ -99,6 +108,8 @@ class Results:
     plan: str
     """Digest of what was asked, and of what data."""
     endpoint: str
+    concurrency: int
+    """Calls on their way at once, when it was last asked; 0: unknown."""
     version: str
     """Of this program."""
     models: tuple[ModelResult, ...]
@@ -112,7 +123,7 @@ class Results:
 
     @property
     def missing(self) -> int:
-        """Pairs of any model without a forecast."""
+        """Forecasts of any model that did not come."""
         return sum(model.missing for model in self.models)
 
     def write(self, folder: Path) -> None:
@@ -122,7 +133,8 @@ class Results:
             OSError: it cannot be written.
         """
         text = json.dumps(finite(asdict(self)), indent=2, allow_nan=False) + "\n"
-        (folder / RESULTS_FILE).write_text(text, encoding="utf-8")
+        with replacing(folder / RESULTS_FILE) as temporary:
+            temporary.write_text(text, encoding="utf-8")
 
     @classmethod
     def read(cls, folder: Path) -> "Results":
@@ -136,13 +148,14 @@ class Results:
             return TypeAdapter(cls).validate_python(_nan(json.loads(file.read_text(encoding="utf-8"))))
         except OSError as error:
             raise BenchmarkError(f"{file}: cannot be read: {error.strerror}") from error
-        except (ValueError, ValidationError) as error:
+        except (ValueError, AttributeError, TypeError, ValidationError) as error:
             raise BenchmarkError(f"{file}: not a benchmark's results: {error}") from error
 
 
 def write_instances(folder: Path, figures: Mapping[str, Floats]) -> None:
     """Writes ``instances.npz``: see ``PER_INSTANCE``."""
-    np.savez_compressed(folder / INSTANCES_FILE, **figures)  # type: ignore[arg-type]
+    with replacing(folder / INSTANCES_FILE) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **figures)  # type: ignore[arg-type]
 
 
 def read_instances(folder: Path) -> dict[str, Floats]:
@@ -157,7 +170,7 @@ def read_instances(folder: Path) -> dict[str, Floats]:
     try:
         with np.load(file, allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, BadZipFile) as error:
         raise BenchmarkError(f"{file}: cannot be read: {error}") from error
 
 

@@ -1,7 +1,7 @@
 """A whole benchmark: what ``cab-forecast benchmark`` does."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
@@ -11,9 +11,9 @@ from benchmark.answers import read_answers
 from benchmark.archive import Archive
 from benchmark.hard import HardCase, hard_case, shown_cases
 from benchmark.judge import Judged, judge
-from benchmark.models import choose, key
+from benchmark.models import choose
 from benchmark.plan import PlannedScene, digest, plan_scenes
-from benchmark.replay import Refusal, Replay, Replayed
+from benchmark.replay import Replay, Replayed
 from benchmark.results import Results
 from benchmark.score import Judging
 from cab.forecast.v1.model_service_pb2 import Model
@@ -81,6 +81,7 @@ class Benchmark:
         with Archive(self.folder) as archive:
             archive.bind(self._facts())
             archive.note("endpoint", endpoint)
+            archive.note("concurrency", str(replay.concurrency))
             for name, model in replay.models.items():
                 archive.register(name, model)
             return await replay.run(client, archive, tick)
@@ -95,12 +96,11 @@ class Benchmark:
             BenchmarkError: there are no answers, or to something else, or none of a name.
         """
         with Archive(self.folder, read_only=True) as archive:
-            archive.bind(self._facts())
+            archive.check(self._facts())
             saved = archive.models()
-        chosen = choose(list(saved.values()), self.protocol, names) if names else saved
-        if not chosen:
+        if not saved:
             raise BenchmarkError(f"{self.folder}: there are no saved answers")
-        return {key(model): model for model in chosen.values()}
+        return choose(list(saved.values()), self.protocol, names, str(self.folder)) if names else saved
 
     def judge(
         self, models: Mapping[str, Model], processes: int, tick: Callable[[int], None]
@@ -117,21 +117,27 @@ class Benchmark:
         """
         judged = judge(self.folder, self.scenes, models, self.judging, processes, tick)
         with Archive(self.folder, read_only=True) as archive:
-            endpoint = archive.facts().get("endpoint", "")
+            facts, refusals = archive.facts(), archive.refusals()
         results = Results(
             data=self.kind,
             split=self.split,
             protocol=self.protocol,
             pairs=self.pairs,
-            limit=self.limit,
+            limit=None if self.limit is None or self.limit > self.pairs else self.limit,
             consistency=self.judging.consistency,
             samples=self.judging.samples,
             draws=self.judging.draws,
             seed=self.judging.seed,
             plan=self.plan,
-            endpoint=endpoint,
+            endpoint=facts.get("endpoint", ""),
+            concurrency=int(facts.get("concurrency", 0)),
             version=version("cab-forecast"),
             models=judged.models,
+            refusals=tuple(
+                f"{one.model}, {one.scene}, frame {one.frame}: {one.why}"
+                for one in refusals
+                if one.model in models
+            ),
         )
         return results, judged
 
@@ -160,7 +166,9 @@ class Benchmark:
             "data": self.kind,
             "split": self.split,
             "protocol": self.protocol.value,
-            "plan": self.plan,
+            "limit": str(self.limit or "none"),
+            "consistency": "yes" if self.judging.consistency else "no",
+            "plan": self.plan[:16],
         }
 
 
@@ -174,9 +182,3 @@ async def listed_models(client: AsyncClient) -> list[Model]:
         return await client.list_models()
     except ForecastError as error:
         raise BenchmarkError(f"the endpoint does not answer: {error}") from error
-
-
-def with_refusals(results: Results, refusals: Sequence[Refusal]) -> Results:
-    """The results, with what the endpoint refused."""
-    said = tuple(f"{one.model}, {one.scene}, frame {one.frame}: {one.why}" for one in refusals)
-    return replace(results, refusals=said)

@@ -10,7 +10,7 @@ import torch
 from benchmark.answers import CallTimes, SceneAnswers, read_answers
 from benchmark.archive import Archive
 from benchmark.consistency import consistency_metrics
-from benchmark.models import PHYSICS_ORACLE
+from benchmark.models import PHYSICS_ORACLE, oldest_first
 from benchmark.plan import PlannedScene
 from model.arrays import Floats, Ints
 from model.data.checks import STEPS_AHEAD
@@ -47,6 +47,8 @@ class SceneScore:
     """[P] each, by the names of ``consistency.METRICS``."""
     statuses: Mapping[str, int] = field(default_factory=dict)
     """How many pairs came out how."""
+    lost: int = 0
+    """Forecasts that were asked for dispersion and convergence alone, and did not come."""
     times: CallTimes | None = None
 
 
@@ -58,7 +60,8 @@ def judge_scene(
     Args:
         folder: of the archive.
         scene: what was asked.
-        models: ``name@version``; where the four physics baselines are among them, the oracle is judged, too.
+        models: ``name@version``; where the four physics baselines are among them, the oracle of their newest
+            versions is judged, too.
         judging: how.
 
     Returns:
@@ -69,7 +72,7 @@ def judge_scene(
         answers = {model: read_answers(archive, model, scene) for model in models}
     truth = scene.truth()
     scores = {model: _score(scene, given, truth, judging) for model, given in answers.items()}
-    by_name = {model.partition("@")[0]: given for model, given in answers.items()}
+    by_name = {model.partition("@")[0]: answers[model] for model in oldest_first(answers)}
     if set(PHYSICS) <= by_name.keys():
         scores[PHYSICS_ORACLE] = _oracle(scene, {name: by_name[name] for name in PHYSICS}, truth, judging)
     return scores
@@ -77,7 +80,7 @@ def judge_scene(
 
 def _score(scene: PlannedScene, answers: SceneAnswers, truth: Floats, judging: Judging) -> SceneScore:
     numbers = answers.instances + scene.first
-    score = SceneScore(numbers, {}, {}, answers.statuses, answers.times)
+    score = SceneScore(numbers, {}, {}, answers.statuses, answers.lost, answers.times)
     if answers.mixture is not None:
         metrics = instance_metrics(
             answers.mixture,

@@ -6,7 +6,6 @@ metrics rank the modes by probability, so entries are written such that it ranks
 """
 
 import json
-import uuid
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Final, TypedDict
@@ -15,6 +14,7 @@ import numpy as np
 
 from benchmark import BenchmarkError
 from benchmark.answers import SceneAnswers
+from benchmark.files import replacing
 from benchmark.plan import PlannedScene
 from model.arrays import Bools, Floats
 from model.data.checks import FUTURE_STEPS
@@ -93,16 +93,11 @@ def write_submission(entries: Iterable[Entry], file: Path) -> None:
     Raises:
         OSError: it cannot be written.
     """
-    new = file.with_name(f".{file.name}.{uuid.uuid4().hex[:12]}.new")
-    try:
-        with new.open("w", encoding="utf-8") as out:
-            out.write("[")
-            for number, entry in enumerate(entries):
-                out.write(("," if number else "") + "\n" + json.dumps(entry, allow_nan=False))
-            out.write("\n]\n")
-        new.replace(file)
-    finally:
-        new.unlink(missing_ok=True)
+    with replacing(file) as temporary, temporary.open("w", encoding="utf-8") as out:
+        out.write("[")
+        for number, entry in enumerate(entries):
+            out.write(("," if number else "") + "\n" + json.dumps(entry, allow_nan=False))
+        out.write("\n]\n")
 
 
 def _padding(modes: Floats, probabilities: Floats) -> Bools:

@@ -37,6 +37,7 @@ HARD_CASES = {
     **{f"hardest {round(100 * share)} %": f"fde_hardest_{round(100 * share)}_m" for share in HARD_SHARES},
     "all": "fde_hardest_all_m",
 }
+_LOST = "lost elsewhere"
 _STATUSES = ("OK", "SHORT_HISTORY", "FALLBACK", "INVALID", "MISSING")
 
 _THEIRS = "Ben-Younes et al. 2022"
@@ -60,10 +61,12 @@ def markdown(results: Results) -> str:
 
 
 def label(model: ModelResult, inputs: Protocol) -> str:
-    """``name@version``, and what it was trained on where that is not what it got."""
-    if model.protocol in {"any", inputs.value}:
-        return model.key
-    return f"{model.key} (trained {model.protocol})"
+    """``name@version``; what it was trained on where that is not what it got; how many pairs another model
+    forecast in its place."""
+    notes = [] if model.protocol in {"any", inputs.value} else [f"trained {model.protocol}"]
+    if model.fallbacks:
+        notes.append(f"{model.fallbacks} of {sum(model.statuses.values())} by a fallback")
+    return f"{model.key} ({', '.join(notes)})" if notes else model.key
 
 
 def _all(results: Results) -> list[_Made]:
@@ -102,7 +105,7 @@ def _consistency(results: Results) -> _Made:
         "forecasts were within τ of the truth."
     )
     why = (
-        "no agent was seen for long enough to have a forecast of every age"
+        "there is no instant with a forecast of every age"
         if results.consistency
         else "dispersion and convergence were not asked for"
     )
@@ -119,15 +122,15 @@ def _consistency(results: Results) -> _Made:
 
 def _hard_cases(results: Results) -> _Made:
     note = (
-        f"{results.statement()}. FDE of the most likely trajectory at 6 s, m, on the pairs that the Kalman "
-        "filter mistakes most, and on all that it ranks."
+        f"{results.statement()}. FDE of the most likely trajectory at 6 s, m, on the pairs that the (newest) "
+        "Kalman filter mistakes most, and on all that it ranks."
     )
     return _metrics(
         results,
         "3. Hard cases",
         note,
         HARD_CASES,
-        "no forecasts of kalman, whose mistakes rank the pairs",
+        "kalman, whose mistakes rank the pairs, was not among the models",
         lambda model: model.metrics if _known(model.metrics, "fde_hardest_1_m") else {},
     )
 
@@ -165,8 +168,10 @@ def _latency(results: Results) -> _Made:
         "mean batch": "batch_agents_mean",
     }
     note = (
-        f"{results.statement()}. ms that the client waited for a call; of these, by the server's account, in "
-        "its queue and in the model; agents in the batch that a call rode in."
+        f"{results.statement()}. ms that the client waited for a call, retries included"
+        + (f", {results.concurrency} on their way at once" if results.concurrency else "")
+        + "; of these, by the server's account, in its queue and in the model; agents in the batch that a "
+        "call rode in."
     )
     return _metrics(
         results,
@@ -229,16 +234,22 @@ def _outcomes(results: Results) -> _Made:
     found = {status for model in results.models for status in model.statuses}
     columns = [*_STATUSES, *sorted(found - {*_STATUSES})]
     note = (
-        f"{results.statement()}. Pairs by how their forecast came out; MISSING: no answer. "
-        f"Calls that were refused: {len(results.refusals)}."
+        f"{results.statement()}. Pairs by how their forecast came out; SHORT_HISTORY: from fewer frames than "
+        "the model uses at most; FALLBACK: by another model; MISSING: no answer. Lost elsewhere: forecasts "
+        "for dispersion and convergence alone that did not come. Calls that were refused: "
+        f"{len(results.refusals)}."
     )
     return _metrics(
         results,
         "8. How pairs came out",
         note,
-        {column: column for column in columns},
+        {column: column for column in [*columns, _LOST]},
         "no pairs",
-        lambda model: {status: model.statuses.get(status, 0) for status in columns} if model.statuses else {},
+        lambda model: (
+            {status: model.statuses.get(status, 0) for status in columns} | {_LOST: model.lost}
+            if model.statuses
+            else {}
+        ),
     )
 
 

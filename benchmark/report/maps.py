@@ -36,10 +36,7 @@ def case_map(case: HardCase, styles: Mapping[str, Style]) -> Figure:
     size = _PANEL if count >= _PANELS_A_ROW else _LARGE_PANEL
     figure, panels = grid(count, _PANELS_A_ROW, size, size)
     low, high = _view(case)
-    request = PredictRequest()
-    around = crop(case.raster, np.stack([low, high]))
-    if around is not None:
-        request.scene_raster.CopyFrom(around)
+    request = PredictRequest(scene_raster=crop(case.raster, np.stack([low, high])))
     for axes in panels:
         _ground(axes, request, low, high)
         _agent(axes, case)

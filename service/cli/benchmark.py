@@ -1,6 +1,7 @@
 """``cab-forecast benchmark``: the paper's tables through a running server, and comparisons of two runs."""
 
 import os
+import sqlite3
 from pathlib import Path
 from typing import Annotated
 
@@ -90,8 +91,8 @@ def benchmark(
             kind, READERS[kind](path), split, parse_protocol(protocol), saved or folder, judging, limit
         )
         asking = None if saved else Asking(endpoint, token, concurrency, timeout)
-        missing = show_benchmark(whole, names, asking, folder, processes or os.cpu_count() or 1)
-    except (BenchmarkError, DataError, OSError, ValueError) as error:
+        missing = show_benchmark(whole, names, asking, folder, processes or len(os.sched_getaffinity(0)))
+    except (BenchmarkError, DataError, OSError, ValueError, sqlite3.Error) as error:
         fail(str(error))
     if missing:
         fail(f"{missing} forecasts are missing: the figures are of the others")

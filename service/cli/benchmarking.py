@@ -1,8 +1,9 @@
 """A benchmark on the terminal: how far it is, its tables, and the files that it leaves."""
 
 import asyncio
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 from rich.console import Console
@@ -20,12 +21,14 @@ from rich.progress import (
 )
 from rich.text import Text
 
+from benchmark import BenchmarkError
 from benchmark.answers import read_answers
 from benchmark.archive import Archive
-from benchmark.models import choose
-from benchmark.replay import RETRIES, Refusal
+from benchmark.files import replacing
+from benchmark.models import choose, key, unfit
+from benchmark.replay import RETRIES
 from benchmark.results import Results, write_instances
-from benchmark.run import Benchmark, listed_models, with_refusals
+from benchmark.run import Benchmark, listed_models
 from benchmark.submission import submission_entries, write_submission
 from benchmark.tables import left_out, markdown, tables
 from cab.forecast.v1.model_service_pb2 import Model
@@ -73,41 +76,34 @@ def show_benchmark(
     with console.status("reading the data"):
         forecasts = sum(scene.forecasts for scene in whole.scenes)
     console.print(f"{whole.pairs} pairs, {forecasts} forecasts of each model", highlight=False)
-    refusals: list[Refusal] = []
-    if asking is None:
-        models = whole.saved_models(names)
-    else:
-        models, refusals = asyncio.run(_ask(whole, names, asking, console))
+    models = whole.saved_models(names) if asking is None else asyncio.run(_ask(whole, names, asking, console))
     with _bar(console, "pairs/s") as bar:
         task = bar.add_task("judging", total=whole.pairs)
         results, judged = whole.judge(models, processes, lambda pairs: bar.advance(task, pairs))
-    results = with_refusals(results, refusals)
     out.mkdir(parents=True, exist_ok=True)
     results.write(out)
     write_instances(out, judged.each)
-    (out / TABLES_FILE).write_text(markdown(results), encoding="utf-8")
-    written = [*_submissions(whole, models, out), _page(whole, results, judged.mismatch_m, out, console)]
+    with replacing(out / TABLES_FILE) as temporary:
+        temporary.write_text(markdown(results), encoding="utf-8")
+    page = _page(whole, results, judged.mismatch_m, out, console)
+    written = [*([] if page is None else [page]), *_submissions(whole, models, out, console)]
     show_tables(tables(results), out)
     for why in left_out(results):
         Console().print(f"[dim]{escape(why)}[/]", highlight=False)
     for file in written:
-        if file is not None:
-            Console().print(f"  {escape(str(file))}", highlight=False)
+        Console().print(f"  {escape(str(file))}", highlight=False)
     for refusal in results.refusals[:_REFUSALS_SHOWN]:
         console.print(f"[red]refused: {escape(refusal)}[/]", highlight=False)
     return results.missing
 
 
-async def _ask(
-    whole: Benchmark, names: Sequence[str], asking: Asking, console: Console
-) -> tuple[dict[str, Model], list[Refusal]]:
+async def _ask(whole: Benchmark, names: Sequence[str], asking: Asking, console: Console) -> dict[str, Model]:
     async with AsyncClient(asking.endpoint, asking.token, asking.timeout, RETRIES) as client:
         listed = await listed_models(client)
         models = choose(listed, whole.protocol, names)
-        left_out = sorted({f"{one.name}@{one.version}" for one in listed} - models.keys())
-        if left_out and not names:
-            said = f"left out, as they are of the other protocol: {', '.join(left_out)}"
-            console.print(escape(said), highlight=False)
+        for one in listed:
+            if not names and (why := unfit(one, whole.protocol)):
+                console.print(escape(f"left out: {key(one)}: {why}"), highlight=False)
         replay = whole.replay(models, asking.concurrency, asking.timeout)
         with _bar(console, "forecasts/s") as bar:
             task = bar.add_task(f"asking {len(models)} models", total=replay.forecasts())
@@ -116,24 +112,23 @@ async def _ask(
     console.print(
         f"asked for {replayed.asked} forecasts in {replayed.seconds:.1f} s ({rate:.0f}/s)", highlight=False
     )
-    return models, replayed.refusals
+    return models
 
 
-def _submissions(whole: Benchmark, models: Mapping[str, Model], out: Path) -> list[Path]:
-    """A file a model for the challenge's own evaluator, where the data has the challenge's tokens."""
+def _submissions(whole: Benchmark, models: Iterable[str], out: Path, console: Console) -> Iterator[Path]:
+    """Writes a file a model for the challenge's own evaluator, where the data has the challenge's tokens."""
     if not all(pair.token for scene in whole.scenes for pair in scene.pairs):
-        return []
-    files = []
+        return
     with Archive(whole.folder, read_only=True) as archive:
-        for key in models:
-            entries = [
-                entry
-                for scene in whole.scenes
-                for entry in submission_entries(scene, read_answers(archive, key, scene))
-            ]
-            files.append(out / f"submission-{key}.json")
-            write_submission(entries, files[-1])
-    return files
+        for model in models:
+            file = out / f"submission-{model}.json"
+            each = (submission_entries(scene, read_answers(archive, model, scene)) for scene in whole.scenes)
+            try:
+                write_submission(chain.from_iterable(each), file)
+            except BenchmarkError as error:
+                console.print(escape(f"no submission of {model}: {error}"), highlight=False)
+            else:
+                yield file
 
 
 def _page(

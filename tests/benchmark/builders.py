@@ -101,6 +101,7 @@ def made_results(*models: ModelResult, protocol: Protocol = Protocol.CAUSAL) -> 
         seed=3,
         plan="0123456789abcdef",
         endpoint="127.0.0.1:50051",
+        concurrency=16,
         version="0.1.0",
         models=models or (made_model(),),
     )

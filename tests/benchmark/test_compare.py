@@ -184,6 +184,22 @@ def test_a_folder_without_results_is_named(tmp_path: Path) -> None:
         compare(folder, empty)
 
 
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"models": [{"metrics": null}]}', '{"models": [3]}'])
+def test_what_are_no_results_is_named(tmp_path: Path, text: str) -> None:
+    (tmp_path / "results.json").write_text(text)
+    with pytest.raises(BenchmarkError, match=r"results\.json: not a benchmark's results"):
+        compare(tmp_path, tmp_path)
+
+
+def test_figures_that_are_cut_short_are_named(tmp_path: Path) -> None:
+    made_results().write(tmp_path)
+    write_instances(tmp_path, {"cab@1.0.0/nll": np.zeros(10)})
+    file = tmp_path / "instances.npz"
+    file.write_bytes(file.read_bytes()[:-30])
+    with pytest.raises(BenchmarkError, match=r"instances\.npz: cannot be read"):
+        compare(tmp_path, tmp_path)
+
+
 def test_figures_of_another_number_of_pairs_are_refused(tmp_path: Path) -> None:
     a = saved(tmp_path / "a", made_results(), **{FDE: np.zeros(PAIRS)})
     b = saved(tmp_path / "b", made_results(), **{FDE: np.zeros(PAIRS - 1)})

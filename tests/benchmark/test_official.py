@@ -96,7 +96,7 @@ def ask(dataroot: Path, split: str, folder: Path, models: Sequence[str]) -> Aske
             chosen = choose(await client.list_models(), Protocol.CAUSAL, models)
             with Archive(folder) as archive:
                 replayed = await Replay(scenes, chosen, Protocol.CAUSAL).run(client, archive, lambda _: None)
-                assert not replayed.refusals
+                assert not replayed.refused
                 return {
                     model.name: [read_answers(archive, key, scene) for scene in scenes]
                     for key, model in chosen.items()

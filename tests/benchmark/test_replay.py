@@ -8,12 +8,22 @@ import numpy as np
 import pytest
 
 from benchmark import BenchmarkError
+from benchmark import replay as replay_module
 from benchmark.archive import Archive
 from benchmark.plan import Call
 from benchmark.replay import Replay, Replayed, keep_the_likeliest
 from cab.forecast.v1.model_service_pb2 import Model
 from cab.forecast.v1.prediction_service_pb2 import AgentForecast, PredictRequest, PredictResponse
-from cab_forecast import AsyncClient, BadRequest, ForecastError, Unavailable, forecasts
+from cab_forecast import (
+    AsyncClient,
+    BadRequest,
+    DeadlineExceeded,
+    ForecastError,
+    InternalError,
+    NotFound,
+    Unavailable,
+    forecasts,
+)
 from model.forecaster import Protocol
 from tests.benchmark.scenes import planned
 
@@ -58,7 +68,7 @@ def test_every_model_is_asked_every_call_once(tmp_path: Path) -> None:
     assert len(asked) == len(set(asked)) == 2 * CALLS
     assert endpoint.most == 3
     assert replayed.asked == sum(ticks) == 2 * FORECASTS
-    assert not replayed.refusals
+    assert not replayed.refused
 
 
 def test_what_has_its_answer_is_not_asked_again(tmp_path: Path) -> None:
@@ -78,10 +88,42 @@ def test_what_has_its_answer_is_not_asked_again(tmp_path: Path) -> None:
 def test_a_refused_call_costs_no_other(tmp_path: Path) -> None:
     endpoint = Endpoint({2: BadRequest("agents[1].id is wrong")})
     replayed, _ = run(tmp_path, endpoint, concurrency=1)
-    (refusal,) = replayed.refusals
+    assert replayed.refused == 1
+    with Archive(tmp_path, read_only=True) as archive:
+        (refusal,) = archive.refusals()
     assert (refusal.model, refusal.scene, refusal.why) == ("one@1.0.0", "scene-1", "agents[1].id is wrong")
     assert refusal.frame / 2 == endpoint.requests[2].time
     assert len(endpoint.requests) == 2 * CALLS
+
+
+def test_a_refused_call_is_forgotten_once_it_has_an_answer(tmp_path: Path) -> None:
+    run(tmp_path, Endpoint({2: InternalError("oh")}), concurrency=1)
+    endpoint = Endpoint()
+    run(tmp_path, endpoint)
+    assert len(endpoint.requests) == 1
+    with Archive(tmp_path, read_only=True) as archive:
+        assert not archive.refusals()
+
+
+def test_a_late_answer_is_asked_for_again(tmp_path: Path) -> None:
+    endpoint = Endpoint({2: DeadlineExceeded("late"), 3: DeadlineExceeded("late")})
+    replayed, _ = run(tmp_path, endpoint, concurrency=1)
+    assert not replayed.refused
+    assert endpoint.requests[2] == endpoint.requests[3] == endpoint.requests[4]
+    assert len(endpoint.requests) == 2 * CALLS + 2
+
+
+def test_an_endpoint_that_refuses_everything_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(replay_module, "MOST_REFUSED", 5)
+    endpoint = Endpoint({number: BadRequest("no") for number in range(3, 100)})
+    with pytest.raises(BenchmarkError, match="the endpoint refuses: no; answers so far are kept"):
+        run(tmp_path, endpoint, concurrency=1)
+    assert len(endpoint.requests) == 8
+
+
+def test_an_endpoint_without_the_model_says_so(tmp_path: Path) -> None:
+    with pytest.raises(BenchmarkError, match="the endpoint refuses: no model one"):
+        run(tmp_path, Endpoint({0: NotFound("no model one")}))
 
 
 def test_of_what_is_not_due_the_likeliest_mode_stays() -> None:

@@ -101,6 +101,13 @@ def test_the_part_of_the_map_that_is_sent_shows_the_same() -> None:
     np.testing.assert_allclose(patches(cut), patches(whole), atol=1e-6)
 
 
-def test_off_the_map_there_is_none() -> None:
-    whole = planned()[0].record.raster
-    assert crop(whole, np.array([[5000.0, 5000.0]])) is None
+def test_off_the_map_nothing_is_driveable() -> None:
+    """An unknown map is another thing."""
+    whole = raster(origin=(5000.0, 5000.0))
+    part = crop(whole, planned()[0].origin())
+    assert (part.rows, part.columns) == (1, 1)
+    cut = Raster(
+        decode_layers(part.image, 1, 1).astype(np.uint8), np.array([part.origin_x, part.origin_y]), 3.0
+    )
+    np.testing.assert_array_equal(patches(cut), patches(whole))
+    assert (patches(cut) == -1).all()

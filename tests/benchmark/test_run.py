@@ -18,7 +18,9 @@ from benchmark.replay import Replayed
 from benchmark.results import Results
 from benchmark.run import Benchmark, listed_models
 from benchmark.score import Judging
+from benchmark.tables import markdown
 from cab.forecast.v1.model_service_pb2 import Model
+from cab.forecast.v1.prediction_service_pb2 import FORECAST_STATUS_FALLBACK
 from cab_forecast import AsyncClient
 from model.evaluation import subjects
 from model.evaluation.run import Evaluation
@@ -123,7 +125,10 @@ def test_what_a_run_tells(tmp_path: Path, server: Server) -> None:
     assert cases[0].mismatch_m == judged.mismatch_m.max()
     assert [case.mismatch_m for case in cases] == sorted((case.mismatch_m for case in cases), reverse=True)
     assert len({(case.scene, case.agent) for case in cases}) == len(cases) == 6
-    np.testing.assert_array_equal(cases[0].history.shape[1], 2)
+    hardest = int(judged.mismatch_m.argmax())
+    scene = next(scene for scene in whole.scenes if scene.first <= hardest < scene.first + len(scene.pairs))
+    np.testing.assert_array_equal(cases[0].truth, scene.truth()[hardest - scene.first])
+    np.testing.assert_array_equal(cases[0].history[-1], scene.origin()[hardest - scene.first])
 
 
 def test_what_is_saved_gives_the_same_again(tmp_path: Path, server: Server) -> None:
@@ -170,7 +175,7 @@ def test_a_server_that_restarts_midway_loses_nothing(tmp_path: Path, models: Pat
         assert not asking.done()  # or the test has shown nothing
         with in_thread(settings(models=models, grpc=address)):
             chosen, replayed = asking.result(120)
-    assert not replayed.refusals
+    assert not replayed.refused
     results, _ = judge(whole, chosen)
     assert results.missing == 0
     assert all(sum(model.statuses.values()) == PAIRS for model in results.models if model.version)
@@ -178,9 +183,9 @@ def test_a_server_that_restarts_midway_loses_nothing(tmp_path: Path, models: Pat
 
 def test_answers_to_something_else_are_not_judged(tmp_path: Path, server: Server) -> None:
     ask(made(tmp_path, limit=5), f"grpc://{server.grpc_address}", "kalman")
-    with pytest.raises(BenchmarkError, match="holds answers of another run: plan was"):
+    with pytest.raises(BenchmarkError, match="holds answers of another run: limit was 5, is none"):
         made(tmp_path).saved_models()
-    with pytest.raises(BenchmarkError, match="protocol was 'causal', is 'paper'"):
+    with pytest.raises(BenchmarkError, match="protocol was causal, is paper"):
         made(tmp_path, Protocol.PAPER, limit=5).saved_models()
 
 
@@ -192,8 +197,40 @@ def test_an_instance_without_an_answer_is_missed(tmp_path: Path, server: Server)
         archive._file.execute("DELETE FROM answers WHERE scene = 'scene-2' AND frame = ?", (lost.frame,))
     results, _ = judge(whole, chosen)
     assert results.missing == 2 * len(lost.due) > 0
+    assert results.models[0].lost == 0
     assert results.models[0].statuses["MISSING"] == len(lost.due)
     assert np.isfinite(results.models[0].metrics["fde_ml_6s_m"])
+
+
+def test_a_forecast_for_dispersion_alone_is_missed_too(tmp_path: Path, server: Server) -> None:
+    whole = made(tmp_path)
+    chosen = ask(whole, f"grpc://{server.grpc_address}", "kalman")
+    whole_instants = judge(whole, chosen)[0].models[0].instants
+    lost = whole.scenes[0].calls[-1]
+    assert not lost.due
+    with Archive(tmp_path) as archive:
+        archive._file.execute("DELETE FROM answers WHERE scene = 'scene-1' AND frame = ?", (12,))
+        archive._file.execute("DELETE FROM answers WHERE scene = 'scene-1' AND frame = ?", (lost.frame,))
+    (kalman,) = judge(whole, chosen)[0].models
+    assert kalman.statuses.get("MISSING", 0) == 0
+    assert kalman.missing == kalman.lost > len(lost.tracks)
+    assert kalman.instants < whole_instants
+
+
+def test_the_fallbacks_of_a_model_are_said(tmp_path: Path, server: Server) -> None:
+    """As if the server had said so of every pair."""
+    whole = made(tmp_path)
+    chosen = ask(whole, f"grpc://{server.grpc_address}", "kalman")
+    with Archive(tmp_path) as archive:
+        for scene in whole.scenes:
+            for frame, answer in list(archive.answers("kalman@1.0.0", scene.record.name)):
+                (call,) = (call for call in scene.calls if call.frame == frame)
+                for forecast in answer.response.forecasts:
+                    forecast.status = FORECAST_STATUS_FALLBACK
+                archive.add("kalman@1.0.0", scene.record.name, call, answer)
+    results, _ = judge(whole, chosen)
+    assert results.models[0].fallbacks == PAIRS
+    assert f"kalman@1.0.0 ({PAIRS} of {PAIRS} by a fallback)" in markdown(results)
 
 
 def test_nobody_at_the_endpoint(tmp_path: Path) -> None:

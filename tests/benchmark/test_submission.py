@@ -34,7 +34,7 @@ PAIRS = len(SCENE.pairs)
 
 def answered(mixture: TrajectoryMixture) -> SceneAnswers:
     """Answers to the first pairs, as many as the mixture has."""
-    return SceneAnswers(np.arange(len(mixture)), mixture, {}, {}, CallTimes(*[np.zeros(0)] * 4))
+    return SceneAnswers(np.arange(len(mixture)), mixture, {}, 0, {}, CallTimes(*[np.zeros(0)] * 4))
 
 
 def wandering(modes: int, seed: int = 0) -> TrajectoryMixture:

@@ -68,7 +68,8 @@ def test_latency_is_in_milliseconds_and_has_no_oracle() -> None:
 
 def test_how_pairs_came_out() -> None:
     odd = replace(made_model("odd"), statuses={"FALLBACK": 3, "SURPRISING": 7})
-    table = titled(tables(made_results(made_model(), odd)), "How pairs")
+    some_lost = replace(made_model(), lost=2)
+    table = titled(tables(made_results(some_lost, odd)), "How pairs")
     assert cells(table) == {
         "model": "cab@1.0.0",
         "OK": "9",
@@ -77,8 +78,10 @@ def test_how_pairs_came_out() -> None:
         "INVALID": "0",
         "MISSING": "1",
         "SURPRISING": "0",
+        "lost elsewhere": "2",
     }
     assert cells(table, 1)["SURPRISING"] == "7"
+    assert cells(table, 1)["model"] == "odd@1.0.0 (3 of 10 by a fallback)"
 
 
 @pytest.mark.parametrize(
@@ -133,7 +136,9 @@ def test_a_table_with_nothing_to_say_is_left_out_and_says_why() -> None:
     reasons = left_out(results)
     assert len(reasons) == 7
     assert "2. Dispersion and convergence: left out: dispersion and convergence were not asked for" in reasons
-    assert "3. Hard cases: left out: no forecasts of kalman, whose mistakes rank the pairs" in reasons
+    assert (
+        "3. Hard cases: left out: kalman, whose mistakes rank the pairs, was not among the models" in reasons
+    )
     assert any(reason.startswith("6. Latency: left out") for reason in reasons)
     assert all(f"- {reason}" in markdown(results) for reason in reasons)
 

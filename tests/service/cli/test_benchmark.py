@@ -18,10 +18,11 @@ from benchmark.archive import FILE
 from model.data.sources import READERS, parse_data
 from service.cli.main import app
 from service.server import Server
-from tests.benchmark.scenes import PAIRS, RECORDS, write_nuscenes_pred
+from tests.benchmark.scenes import PAIRS, READER, RECORDS, write_nuscenes_pred
+from tests.model.evaluation.builders import checkpoints
 from tests.service.servers import in_thread, settings
 
-MODELS = "kalman,constant-velocity-yaw"
+MODELS = "cab,kalman"
 DEADLINE = 120.0
 
 
@@ -33,8 +34,9 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """A server with the baselines."""
-    with in_thread(settings(models=tmp_path_factory.mktemp("none"), default_model="kalman")) as running:
+    """A server with two learned models and the baselines."""
+    folder = checkpoints(tmp_path_factory.mktemp("models"))
+    with in_thread(settings(models=folder, default_model="kalman")) as running:
         yield running
 
 
@@ -64,7 +66,7 @@ def test_the_tables_of_a_run_and_of_its_saved_answers(tmp_path: Path, data: str,
         assert text in shown
         assert text in (out / "tables.md").read_text()
     assert "asked for" in said
-    assert len(results(out)["models"]) == 6
+    assert len(results(out)["models"]) == 8
     # Again from what is saved, without an endpoint, into another folder
     code, _, said = run(
         "--data",
@@ -145,6 +147,33 @@ def test_missing_forecasts_end_in_an_error(tmp_path: Path, data: str) -> None:
     assert "kalman" in shown
     missing = results(tmp_path / "run")["models"][0]["statuses"]["MISSING"]
     assert 0 < missing < PAIRS
+
+
+def test_data_with_tokens_gives_submissions_of_who_answered_it_all(
+    tmp_path: Path, server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(READERS, "made", lambda path: READER)
+    arguments = ["--data", "made:here", "--split", "some", "--models", MODELS, "--samples", "0"]
+    arguments += ["--processes", "1", "--endpoint", f"grpc://{server.grpc_address}"]
+    out = tmp_path / "run"
+    assert run(*arguments, "--out", str(out))[0] == 0
+    assert {file.name for file in out.glob("submission-*")} == {
+        "submission-cab@1.0.0.json",
+        "submission-kalman@1.0.0.json",
+    }
+    assert len(json.loads((out / "submission-cab@1.0.0.json").read_text())) == PAIRS
+    file = sqlite3.connect(out / FILE)
+    with file:
+        file.execute("DELETE FROM answers WHERE model = 'cab@1.0.0' AND scene = 'scene-2' AND frame = 8")
+    file.close()
+    again = tmp_path / "again"
+    code, shown, said = run(*arguments[:8], "--processes", "1", "--from", str(out), "--out", str(again))
+    assert code == 1
+    assert "no submission of cab@1.0.0: " in said
+    assert "forecasts are missing" in said
+    assert [one.name for one in again.glob("submission-*")] == ["submission-kalman@1.0.0.json"]
+    assert (again / "report.html").is_file()
+    assert "8. How pairs came out" in shown
 
 
 @pytest.mark.parametrize(
