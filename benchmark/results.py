@@ -168,7 +168,7 @@ def read_instances(folder: Path) -> dict[str, Floats]:
     if not file.is_file():
         return {}
     try:
-        with np.load(file, allow_pickle=False) as arrays:
+        with file.open("rb") as opened, np.load(opened, allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
     except (OSError, ValueError, BadZipFile) as error:
         raise BenchmarkError(f"{file}: cannot be read: {error}") from error
