@@ -1,9 +1,10 @@
 """How wide a trained network's forecasts should be.
 
-An objective that does not count its worst errors (CAB's, Reweight's and RUBiZ's clamp them) leaves a network
-too sure of itself. One factor on all standard deviations, so that nine of ten training positions lie in the
-regions that are said to hold 90 %, mends that and leaves means and probabilities as they are (in the way of
-temperature scaling, Guo et al. 2017).
+An objective that does not count its worst errors (CAB's, Reweight's and RUBiZ's clamp them), or that counts
+displacements beside the likelihood, leaves a network too sure of itself. One factor on all standard deviations,
+under which training positions are the likeliest, mends the most of that and leaves means and probabilities as
+they are (in the way of temperature scaling, Guo et al. 2017, which fits by likelihood, too). Wide enough for
+nine of ten positions to lie in the 90 % regions would take more: errors have longer tails than Gaussians.
 """
 
 import math
@@ -12,24 +13,23 @@ from typing import Final
 import torch
 
 from model.forecaster import Context
-from model.metrics.density import LABEL_NOISE_M, density_rank, inside_region
+from model.metrics.density import LABEL_NOISE_M, nll
 from model.mixture import TrajectoryMixture
 from model.networks.network import AgentNetwork
 from model.training.source import BatchSource
 
-PAIRS: Final = 512
+PAIRS: Final = 2048
 """That the factor is fitted to, spread over the split."""
-LEVEL: Final = 0.9
 LEAST, MOST = 0.25, 8.0
 """Bounds of the factor."""
-_DRAWS: Final = 99
 _BATCH: Final = 256
-_ROUNDS: Final = 9
+_ROUNDS: Final = 16
+_GOLDEN: Final = (math.sqrt(5) - 1) / 2
 
 
 @torch.no_grad()
 def fit_width(network: AgentNetwork, pairs: BatchSource) -> float:
-    """The factor on the standard deviations under which 90 % regions hold 90 % of the pairs' positions.
+    """The factor on the standard deviations under which the pairs' positions are the likeliest.
 
     Args:
         network: in evaluation mode.
@@ -42,22 +42,33 @@ def fit_width(network: AgentNetwork, pairs: BatchSource) -> float:
         log_weights, positions = network(features, Context.FULL, future.shape[1])
         parts = (log_weights, positions.mean, positions.covariance, features["origin"])
         truth = (future.double() + features["origin"][:, None]).cpu().numpy()
-        judged.append((TrajectoryMixture(*(part.cpu() for part in parts)), truth, indices.tolist()))
+        judged.append((TrajectoryMixture(*(part.cpu() for part in parts)), truth))
 
-    def held(factor: float) -> float:
-        inside = 0.0
-        for mixture, truth, seeds in judged:
+    def unlikely(log_factor: float) -> float:
+        total = 0.0
+        for mixture, truth in judged:
             wider = TrajectoryMixture(
-                mixture.log_weights, mixture.means, factor**2 * mixture.covariances, mixture.origin
+                mixture.log_weights,
+                mixture.means,
+                math.exp(2 * log_factor) * mixture.covariances,
+                mixture.origin,
             )
-            rank = density_rank(wider, truth, seeds, LABEL_NOISE_M, _DRAWS)
-            inside += float(inside_region(rank, LEVEL).mean()) * len(seeds)
-        return inside / len(chosen)
+            total += float(nll(wider, truth, LABEL_NOISE_M).sum())
+        return total
 
+    # Golden-section search: too narrow or too wide, positions are the less likely the more it is so
     low, high = math.log(LEAST), math.log(MOST)
+    left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+    of_left, of_right = unlikely(left), unlikely(right)
     for _ in range(_ROUNDS):
-        middle = (low + high) / 2
-        low, high = (middle, high) if held(math.exp(middle)) < LEVEL else (low, middle)
+        if of_left < of_right:
+            high, right, of_right = right, left, of_left
+            left = high - _GOLDEN * (high - low)
+            of_left = unlikely(left)
+        else:
+            low, left, of_left = left, right, of_right
+            right = low + _GOLDEN * (high - low)
+            of_right = unlikely(right)
     return math.exp((low + high) / 2)
 
 

@@ -84,6 +84,6 @@ def _width(factor: float | None) -> str:
     if factor is None:
         return "as the method has them"
     return (
-        f"standard deviations times {factor:.3f}, fitted after training, so that 90 % regions hold 90 % of "
-        "training positions; means and probabilities are the network's own"
+        f"standard deviations times {factor:.3f}, fitted after training, so that training positions are the "
+        "likeliest; means and probabilities are the network's own"
     )
