@@ -187,7 +187,7 @@ def test_a_body_that_trickles_is_late_too(call_at: Call) -> None:
         start = time.monotonic()
         with pytest.raises(DeadlineExceeded, match=r"within 0\.4 s"):
             call_at(f"http://{address}", {}, "list_models", timeout=0.4)
-        assert 0.35 < time.monotonic() - start < 1.5  # it would have come after 20 s
+        assert 0.35 < time.monotonic() - start < 10  # it would have come after 20 s
 
 
 def test_a_gateway_may_compress(call_at: Call, script: Script) -> None:

@@ -434,8 +434,8 @@ async def test_the_deadline_holds_for_reading_too() -> None:
     async with opened(FakeForecaster(), max_timeout=0.1) as plane:
         started = time.monotonic()
         with pytest.raises(DeadlineExceeded):
-            await plane.predict(slow(1.0))
-        assert time.monotonic() - started < 0.8
+            await plane.predict(slow(3.0))
+        assert time.monotonic() - started < 2.8
 
 
 async def test_the_earlier_deadline_holds() -> None:
