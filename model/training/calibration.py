@@ -4,8 +4,8 @@ An objective that does not count its worst errors (CAB's, Reweight's and RUBiZ's
 displacements beside the likelihood, leaves a network too sure of itself. One factor on all standard
 deviations, under which training positions are the likeliest, mends the most of that and leaves means and
 probabilities as they are (in the way of temperature scaling, Guo et al. 2017, which fits by likelihood, too).
-Wide enough for nine of ten positions to lie in the 90 % regions would take more: errors have longer tails than
-Gaussians.
+Wide enough for nine of ten positions to lie in the 90 % regions would take more: errors have longer tails
+than Gaussians.
 """
 
 import math
