@@ -1,7 +1,7 @@
 """Saved answers of one scene as arrays, in the order of what was asked."""
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,6 @@ from benchmark.archive import Answer, Archive
 from benchmark.plan import PlannedScene, full_history
 from cab_forecast import Forecast, forecasts
 from model.arrays import Floats, Ints
-from model.data.scenes import Track
 from model.mixture import TrajectoryMixture
 
 MISSING = "MISSING"
@@ -73,7 +72,7 @@ def _read(archive: Archive, model: str, scene: PlannedScene) -> SceneAnswers:
     tracks = {track.id: number for number, track in enumerate(scene.record.tracks)}
     numbers = {(pair.track, pair.frame): number for number, pair in enumerate(scene.pairs)}
     calls = {call.frame: call for call in scene.calls}
-    full = {number: set(full_history(track.frames).tolist()) for track, number in _numbered(scene)}
+    full = [set(full_history(track.frames).tolist()) for track in scene.record.tracks]
     found: dict[int, Forecast] = {}
     paths: dict[int, list[tuple[int, Floats]]] = {}
     statuses: Counter[str] = Counter()
@@ -103,20 +102,14 @@ def _read(archive: Archive, model: str, scene: PlannedScene) -> SceneAnswers:
         mixture,
         {status: count for status, count in statuses.items() if count},
         scene.forecasts - len(scene.pairs) - others,
-        {track: _in_order(made) for track, made in paths.items()},
+        {track: _stacked(made) for track, made in paths.items()},
         _times(answers),
     )
 
 
-def _numbered(scene: PlannedScene) -> Iterator[tuple[Track, int]]:
-    """Tracks that are asked for, with their numbers."""
-    for number in {track for call in scene.calls for track in call.tracks}:
-        yield scene.record.tracks[number], number
-
-
-def _in_order(made: Sequence[tuple[int, Floats]]) -> tuple[Ints, Floats]:
-    ordered = sorted(made, key=lambda one: one[0])
-    return np.array([frame for frame, _ in ordered], dtype=np.int64), np.stack([path for _, path in ordered])
+def _stacked(made: Sequence[tuple[int, Floats]]) -> tuple[Ints, Floats]:
+    """Frames, which the archive gives in order, and trajectories as arrays."""
+    return np.array([frame for frame, _ in made], dtype=np.int64), np.stack([path for _, path in made])
 
 
 def _mixture(found: Sequence[Forecast], origin: Floats) -> TrajectoryMixture:

@@ -14,13 +14,14 @@ from benchmark import BenchmarkError
 from benchmark.answers import CallTimes
 from benchmark.consistency import METRICS
 from benchmark.hard import hardest_fde
-from benchmark.models import KALMAN, PHYSICS_ORACLE, learned, oldest_first, protocol_of
+from benchmark.models import KALMAN, learned, oldest_first, protocol_of
 from benchmark.plan import PlannedScene
 from benchmark.results import PER_INSTANCE, Latency, ModelResult
 from benchmark.score import Judging, SceneScore, judge_scene
 from cab.forecast.v1.model_service_pb2 import Model
 from model.arrays import Floats
 from model.metrics.aggregate import MetricMeans
+from model.metrics.oracle import ORACLE
 
 _FDE = "fde_ml_6s_m"
 
@@ -124,7 +125,7 @@ def _result(key: str, model: Model | None, known: _Sums, mismatch_m: Floats | No
         metrics |= hardest_fde(known.each[_FDE], mismatch_m)
     instants = known.instants.count(METRICS[0]) if METRICS[0] in known.instants.names() else 0
     if model is None:
-        return ModelResult(PHYSICS_ORACLE, "", "any", "", {}, metrics, instants)
+        return ModelResult(ORACLE, "", "any", "", {}, metrics, instants)
     return ModelResult(
         model.name,
         model.version,

@@ -11,7 +11,6 @@ from model.metrics.oracle import PHYSICS
 
 HORIZON_S = 6.0
 """That is judged."""
-PHYSICS_ORACLE = "physics-oracle"
 KALMAN = "kalman"
 BASELINES = frozenset({*PHYSICS, KALMAN})
 """Models that take their inputs by either protocol."""

@@ -171,6 +171,6 @@ def keep_the_likeliest(response: PredictResponse, call: Call, scene: PlannedScen
         forecast.remaining_weight += sum(forecast.weights) - weight
         for values, size in ((forecast.means, 2), (forecast.covariances, 3)):
             values[:] = values[mode * steps * size : (mode + 1) * steps * size]
-        forecast.mode_ids[:] = [forecast.mode_ids[mode]]
+        forecast.mode_ids[:] = forecast.mode_ids[mode : mode + 1]  # an endpoint may leave them out
         forecast.weights[:] = [weight]
         forecast.most_likely_mode = 0

@@ -10,13 +10,13 @@ import torch
 from benchmark.answers import CallTimes, SceneAnswers, read_answers
 from benchmark.archive import Archive
 from benchmark.consistency import consistency_metrics
-from benchmark.models import PHYSICS_ORACLE, oldest_first
+from benchmark.models import oldest_first
 from benchmark.plan import PlannedScene
 from model.arrays import Floats, Ints
 from model.data.checks import STEPS_AHEAD
 from model.data.scenes import SceneRecord
 from model.metrics.evaluate import instance_metrics
-from model.metrics.oracle import PHYSICS, oracle_figures, oracle_mixture, physics_oracle
+from model.metrics.oracle import ORACLE, PHYSICS, oracle_figures, oracle_mixture, physics_oracle
 
 SEEDS = 1_000_003
 """Between the seeds of two runs of successive ``seed``: more than any split has pairs."""
@@ -74,7 +74,7 @@ def judge_scene(
     scores = {model: _score(scene, given, truth, judging) for model, given in answers.items()}
     by_name = {model.partition("@")[0]: answers[model] for model in oldest_first(answers)}
     if set(PHYSICS) <= by_name.keys():
-        scores[PHYSICS_ORACLE] = _oracle(scene, {name: by_name[name] for name in PHYSICS}, truth, judging)
+        scores[ORACLE] = _oracle(scene, {name: by_name[name] for name in PHYSICS}, truth, judging)
     return scores
 
 

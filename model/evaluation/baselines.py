@@ -13,12 +13,12 @@ from model.arrays import Floats
 from model.data.checks import FUTURE_STEPS, STEPS_AHEAD, check_pairs
 from model.data.protocols import SceneFrames
 from model.data.scenes import DataError, Pair, Reader, SceneRecord
-from model.evaluation.subjects import ORACLE, key
+from model.evaluation.subjects import key
 from model.forecaster import Features, Forecaster, Protocol, join
 from model.kalman import HISTORY_FRAMES
 from model.metrics.aggregate import MetricMeans
 from model.metrics.evaluate import instance_metrics
-from model.metrics.oracle import oracle_figures, oracle_mixture
+from model.metrics.oracle import ORACLE, oracle_figures, oracle_mixture
 from model.scene import AgentType, Raster
 
 

@@ -9,11 +9,12 @@ from model.data.scenes import DataError, Reader
 from model.evaluation.baselines import judge_baselines
 from model.evaluation.learned import Judged, judge_learned, open_validations
 from model.evaluation.results import Results, Row
-from model.evaluation.subjects import ORACLE, Subjects, key
+from model.evaluation.subjects import Subjects, key
 from model.evaluation.tables import markdown
 from model.forecaster import ModelInfo, Protocol
 from model.metrics.aggregate import MetricMeans
 from model.metrics.density import DRAWS
+from model.metrics.oracle import ORACLE
 
 RESULTS_FILE = "results.json"
 TABLES_FILE = "tables.md"

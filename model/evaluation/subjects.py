@@ -7,11 +7,10 @@ from pathlib import Path
 from model import kalman, physics
 from model.checkpoint import Checkpoint
 from model.forecaster import Forecaster, ModelInfo, Protocol
+from model.metrics.oracle import ORACLE
 from model.networks.config import AnyNetworkConfig
 from model.registry import load_checkpoints
 from model.scene import AgentType
-
-ORACLE = "physics-oracle"
 
 
 class EvaluationError(Exception):

@@ -11,6 +11,8 @@ from model.arrays import Floats, Ints
 from model.metrics.displacement import displacement_m
 from model.mixture import TrajectoryMixture
 
+ORACLE = "physics-oracle"
+"""Its name in tables."""
 PHYSICS = (
     "constant-velocity-yaw",
     "constant-speed-yaw-rate",

@@ -65,7 +65,7 @@ def show_benchmark(
         processes: that judge.
 
     Returns:
-        How many forecasts of pairs are missing.
+        How many forecasts are missing.
 
     Raises:
         BenchmarkError: it cannot go on.

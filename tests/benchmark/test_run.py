@@ -13,7 +13,7 @@ import pytest
 from benchmark import BenchmarkError
 from benchmark.archive import Archive
 from benchmark.judge import Judged
-from benchmark.models import BASELINES, PHYSICS_ORACLE, choose
+from benchmark.models import BASELINES, choose
 from benchmark.replay import Replayed
 from benchmark.results import Results
 from benchmark.run import Benchmark, listed_models
@@ -26,7 +26,7 @@ from model.evaluation import subjects
 from model.evaluation.run import Evaluation
 from model.forecaster import Protocol
 from model.metrics.density import DRAWS
-from model.metrics.oracle import PHYSICS
+from model.metrics.oracle import ORACLE, PHYSICS
 from service.server import Server
 from tests.benchmark.scenes import PAIRS, READER
 from tests.model.evaluation.builders import checkpoints
@@ -89,7 +89,7 @@ def test_online_equals_offline(
     chosen = ask(whole, f"{transport}://{address}")
     results, _ = judge(whole, chosen)
     assert results.missing == 0
-    assert {model.name for model in results.models} >= {*BASELINES, PHYSICS_ORACLE, "cab"}
+    assert {model.name for model in results.models} >= {*BASELINES, ORACLE, "cab"}
     offline = Evaluation(
         subjects.choose(models, protocol), "made", READER, "some", protocol, tmp_path / "cache", SAMPLES
     )(lambda *_: None, lambda _: None)
@@ -106,7 +106,7 @@ def test_what_a_run_tells(tmp_path: Path, server: Server) -> None:
     whole = made(tmp_path)
     results, judged = judge(whole, ask(whole, f"grpc://{server.grpc_address}"))
     by_name = {model.name: model for model in results.models}
-    cab, kalman, oracle = by_name["cab"], by_name["kalman"], by_name[PHYSICS_ORACLE]
+    cab, kalman, oracle = by_name["cab"], by_name["kalman"], by_name[ORACLE]
     assert sum(cab.statuses.values()) == PAIRS
     assert cab.statuses["SHORT_HISTORY"] > 0
     assert (cab.protocol, kalman.protocol) == ("causal", "any")

@@ -9,11 +9,10 @@ from model.data.cache import Cache, build_cache
 from model.data.protocols import frame_scene
 from model.data.scenes import DataError, Pair, SceneRecord
 from model.evaluation.baselines import judge_baselines, scene_pairs
-from model.evaluation.subjects import ORACLE
 from model.forecaster import Protocol
 from model.kalman import Kalman
 from model.metrics.evaluate import instance_metrics
-from model.metrics.oracle import PHYSICS, oracle_mixture
+from model.metrics.oracle import ORACLE, PHYSICS, oracle_mixture
 from model.networks.config import NetworkConfig
 from model.single import single_mode
 from tests.model.data.records import FixedReader, raster, record, track
