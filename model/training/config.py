@@ -61,6 +61,9 @@ class TrainingConfig(BaseModel):
     least_learning_rate: float = Field(default=1e-5, ge=0)
     cooldown_epochs: int = Field(default=0, ge=0)
     """The last epochs, over which the learning rate goes down to 0."""
+    averaging: float = Field(default=0.0, ge=0, lt=1)
+    """What a step leaves of the running mean of the parameters, e.g. 0.999; the mean is what is judged and
+    kept. 0: the parameters themselves are."""
     precision: Precision = Precision.BFLOAT16
     """Of convolutions and decoder in training."""
     start: str | None = None

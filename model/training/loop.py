@@ -4,11 +4,12 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from model.network_forecaster import Networks
 from model.training import processes
@@ -72,9 +73,10 @@ class Trainer:
         self.networks = self.learner.networks
         if start is not None:
             begin_with(self.networks, start)
+        self._average = running_mean(self.networks, config.averaging)
         shown = len(epoch_order(train.turned, config.curved_copies, config.seed, epoch=0))
         self._epoch_steps = shown // config.batch_size or 1
-        resumed = load_state(folder, config, self.learner)
+        resumed = load_state(folder, config, self.learner, self._others())
         self.progress = resumed or Progress(epoch=0, step=0, best_epoch=0, best_score=None, seconds=0.0)
 
     def run(self, report: Report, tick: Tick) -> None:
@@ -88,16 +90,23 @@ class Trainer:
             figures = self._epoch(tick)
             if processes.rank() == 0:
                 figures |= self._judge()
-                save_state(self._folder, self.config, self.progress, self.learner)
+                save_state(self._folder, self.config, self.progress, self.learner, self._others())
                 report(self.progress, figures)
 
     def best(self) -> dict[str, Tensor]:
         """Parameters of the best epoch so far, on the CPU."""
         return load_file(self._folder / BEST_FILE)
 
+    def _others(self) -> dict[str, nn.Module]:
+        return {} if self._average is None else {"average": self._average}
+
+    def _judged(self) -> Networks[Any]:
+        """The networks that are judged and kept."""
+        return self.networks if self._average is None else cast("Networks[Any]", self._average.module)
+
     def _judge(self) -> dict[str, float]:
-        self.networks.eval()
-        figures = self._validate(self.networks)
+        networks = self._judged().eval()
+        figures = self._validate(networks)
         score = figures[SCORE]
         if self.progress.best_score is None or score < self.progress.best_score:
             self.progress = replace(self.progress, best_epoch=self.progress.epoch, best_score=score)
@@ -106,7 +115,7 @@ class Trainer:
 
     def _keep_best(self) -> None:
         self._folder.mkdir(parents=True, exist_ok=True)
-        tensors = {k: v.detach().cpu().contiguous() for k, v in self.networks.state_dict().items()}
+        tensors = {k: v.detach().cpu().contiguous() for k, v in self._judged().state_dict().items()}
         temporary = self._folder / f"{BEST_FILE}.new"
         save_file(tensors, temporary)
         temporary.replace(self._folder / BEST_FILE)
@@ -156,6 +165,8 @@ class Trainer:
             apart=self.config.apart_weight,
         )
         terms = self.learner.step(batches, weights, self._rate())
+        if self._average is not None:
+            self._average.update_parameters(self.networks)
         self.progress = replace(self.progress, step=step + 1)
         return terms
 
@@ -165,6 +176,12 @@ class Trainer:
             config.learning_rate, step, config.learning_rate_decay, config.least_learning_rate
         )
         return rate * cooldown(step, config.epochs * steps, config.cooldown_epochs * steps)
+
+
+def running_mean(networks: nn.Module, kept: float) -> AveragedModel | None:
+    """Networks whose parameters are an exponential running mean of others' (Polyak and Juditsky 1992); None
+    where nothing is to be kept of them."""
+    return AveragedModel(networks, multi_avg_fn=get_ema_multi_avg_fn(kept)) if kept else None
 
 
 def begin_with(networks: nn.Module, given: Mapping[str, Tensor]) -> None:

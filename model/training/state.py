@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 from safetensors.torch import load_file, save_file
-from torch import Tensor
+from torch import Tensor, nn
 
 from model.training.config import TrainingConfig, TrainingError
 from model.training.learner import Learner
@@ -32,11 +32,25 @@ class Progress:
     """Spent in training steps so far."""
 
 
-def save_state(folder: Path, config: TrainingConfig, progress: Progress, learner: Learner) -> None:
-    """Writes the state; whoever is interrupted in it finds the one before."""
+def save_state(
+    folder: Path,
+    config: TrainingConfig,
+    progress: Progress,
+    learner: Learner,
+    others: Mapping[str, nn.Module],
+) -> None:
+    """Writes the state; whoever is interrupted in it finds the one before.
+
+    Args:
+        folder: of the run.
+        config: its settings.
+        progress: where it stands.
+        learner: networks and optimisers.
+        others: modules beside the learner's, by names that none of its has.
+    """
     tensors: dict[str, Tensor] = {
         f"{module}.{name}": tensor
-        for module, networks in learner.modules().items()
+        for module, networks in {**learner.modules(), **others}.items()
         for name, tensor in networks.state_dict().items()
     }
     names = _parameter_names(learner)
@@ -57,8 +71,10 @@ def save_state(folder: Path, config: TrainingConfig, progress: Progress, learner
             old.unlink()
 
 
-def load_state(folder: Path, config: TrainingConfig, learner: Learner) -> Progress | None:
-    """Puts a saved state back; None where there is none.
+def load_state(
+    folder: Path, config: TrainingConfig, learner: Learner, others: Mapping[str, nn.Module]
+) -> Progress | None:
+    """Puts a saved state back (see ``save_state``); None where there is none.
 
     Raises:
         TrainingError: it is damaged, or of a run with other settings (more epochs are no other setting).
@@ -73,7 +89,7 @@ def load_state(folder: Path, config: TrainingConfig, learner: Learner) -> Progre
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TrainingError(f"{file}: cannot be resumed: {error}") from error
     _check_same(file, document["config"], config, progress.epoch)
-    for name, networks in learner.modules().items():
+    for name, networks in {**learner.modules(), **others}.items():
         networks.load_state_dict(_under(f"{name}.", tensors))
     names = _parameter_names(learner)
     for name, optimizer in learner.optimizers.items():

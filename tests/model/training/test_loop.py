@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
 from model.forecaster import Context
 from model.network_forecaster import Networks
@@ -64,6 +65,43 @@ def test_a_run_in_two_parts_is_the_same_as_in_one(tmp_path: Path, method: Method
         other = parts.learner.modules()[module].state_dict()
         for name, tensor in networks.state_dict().items():
             assert torch.equal(tensor, other[name]), (module, name)
+
+
+def test_with_averaging_the_running_mean_is_judged_and_kept(tmp_path: Path) -> None:
+    config = small_config(Method.TRAJECTRON, epochs=1, averaging=0.5)
+    judged: list[dict[str, Tensor]] = []
+    steps: list[dict[str, Tensor]] = []
+
+    def note(networks: Networks[Any]) -> dict[str, float]:
+        judged.append({n: p.detach().clone() for n, p in networks.named_parameters()})
+        return validate(networks)
+
+    trainer = Trainer(config, PAIRS, note, tmp_path, torch.device("cpu"))
+
+    def tick(done: int, batches: int) -> None:
+        steps.append({n: p.detach().clone() for n, p in trainer.networks.named_parameters()})
+
+    trainer.run(lambda progress, figures: None, tick)
+    mean = steps[0]
+    for after in steps[1:]:
+        mean = {name: 0.5 * tensor + 0.5 * after[name] for name, tensor in mean.items()}
+    assert len(steps) > 1
+    best = trainer.best()
+    for name, tensor in mean.items():
+        torch.testing.assert_close(judged[0][name], tensor)
+        assert torch.equal(best[name], judged[0][name])
+    assert any(not torch.equal(steps[-1][name], mean[name]) for name in mean)
+
+
+def test_the_running_mean_is_resumed_exactly(tmp_path: Path) -> None:
+    def config(epochs: int) -> TrainingConfig:
+        return small_config(Method.TRAJECTRON, epochs=epochs, averaging=0.9)
+
+    whole, _ = train(config(2), tmp_path / "whole")
+    train(config(1), tmp_path / "parts")
+    parts, _ = train(config(2), tmp_path / "parts")
+    assert parts.progress.best_score == whole.progress.best_score
+    assert all(torch.equal(tensor, parts.best()[name]) for name, tensor in whole.best().items())
 
 
 def test_a_run_begins_with_the_parameters_that_it_is_given(tmp_path: Path) -> None:
