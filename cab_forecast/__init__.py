@@ -8,7 +8,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from cab_forecast.client import AsyncClient, Client
+    from cab_forecast.async_client import AsyncClient
+    from cab_forecast.client import Client
     from cab_forecast.demo import demo_request
     from cab_forecast.errors import (
         BadRequest,
@@ -19,14 +20,18 @@ if TYPE_CHECKING:
         NotFound,
         Overloaded,
         TooLarge,
+        TrackingUnavailable,
         Unauthenticated,
         Unavailable,
+        UnknownTrack,
     )
-    from cab_forecast.forecast import Forecast, Status, forecasts
+    from cab_forecast.forecast import Forecast, Status, Tracking, forecasts, tracking
     from cab_forecast.requests import agent, map_patch, predict_request, scene_raster
+    from cab_forecast.streams import AsyncStream, Stream
 
 __all__ = [
     "AsyncClient",
+    "AsyncStream",
     "BadRequest",
     "Client",
     "DeadlineExceeded",
@@ -37,24 +42,33 @@ __all__ = [
     "NotFound",
     "Overloaded",
     "Status",
+    "Stream",
     "TooLarge",
+    "Tracking",
+    "TrackingUnavailable",
     "Unauthenticated",
     "Unavailable",
+    "UnknownTrack",
     "agent",
     "demo_request",
     "forecasts",
     "map_patch",
     "predict_request",
     "scene_raster",
+    "tracking",
 ]
 
 _MODULES = {
-    "AsyncClient": "client",
+    "AsyncClient": "async_client",
+    "AsyncStream": "streams",
     "Client": "client",
     "demo_request": "demo",
     "Forecast": "forecast",
     "Status": "forecast",
+    "Stream": "streams",
+    "Tracking": "forecast",
     "forecasts": "forecast",
+    "tracking": "forecast",
     "agent": "requests",
     "map_patch": "requests",
     "predict_request": "requests",

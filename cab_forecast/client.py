@@ -1,63 +1,50 @@
-"""The clients: the same calls, blocking or for asyncio, over gRPC or REST."""
+"""The blocking client, over gRPC or REST."""
 
 from os import PathLike
-from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 import tenacity
 
-from cab.forecast.v1.model_service_pb2 import GetModelRequest, ListModelsRequest, Model
+from cab.forecast.v1.consistency_service_pb2 import (
+    GetAgentConsistencyRequest,
+    GetSceneConsistencyRequest,
+    GetSceneConsistencyResponse,
+    InstantConsistency,
+    ListModelConsistencyRequest,
+    ModelConsistency,
+    ResetSceneRequest,
+    WatchSceneRequest,
+    WatchSceneResponse,
+)
+from cab.forecast.v1.model_service_pb2 import ListModelsRequest, Model
 from cab.forecast.v1.prediction_service_pb2 import PredictRequest, PredictResponse
-from cab_forecast.endpoints import DEFAULT_ENDPOINT, parse_endpoint
-from cab_forecast.methods import GET_MODEL, LIST_MODELS, PREDICT, Method, Request, Response
+from cab_forecast.connecting import DEFAULT_RETRIES, DEFAULT_TIMEOUT, ClientSettings, open_transport
+from cab_forecast.endpoints import DEFAULT_ENDPOINT
+from cab_forecast.methods import (
+    GET_AGENT_CONSISTENCY,
+    GET_MODEL,
+    GET_SCENE_CONSISTENCY,
+    LIST_MODEL_CONSISTENCY,
+    LIST_MODELS,
+    PREDICT,
+    RESET_SCENE,
+    WATCH_SCENE,
+    Method,
+    Request,
+    Response,
+    get_model_request,
+)
+from cab_forecast.streams import Stream
 from cab_forecast.timing import RETRY, WAIT, Budget, stop
-from cab_forecast.transport import AsyncTransport, Connection, Encoding, Transport
-
-DEFAULT_TIMEOUT = 5.0
-"""s for a call, retries included."""
-DEFAULT_RETRIES = 2
-
-
-class _Settings:
-    """What a client was made with, checked."""
-
-    def __init__(
-        self,
-        endpoint: str,
-        token: str | None,
-        timeout: float,
-        retries: int,
-        *,
-        encoding: Encoding,
-        ca_file: str | PathLike[str] | None,
-    ) -> None:
-        if retries < 0:
-            raise ValueError(f"retries must not be negative, but is {retries}")
-        if encoding not in ("protobuf", "json"):
-            raise ValueError(f"encoding must be 'protobuf' or 'json', not {encoding!r}")
-        Budget(timeout)  # refuses what is no timeout here rather than at the first call
-        self.connection = Connection(
-            parse_endpoint(endpoint), token, encoding, Path(ca_file) if ca_file is not None else None
-        )
-        if encoding == "json" and self.connection.endpoint.transport == "grpc":
-            raise ValueError("encoding='json' is for http:// and https:// endpoints; gRPC speaks protobuf")
-        self.timeout = timeout
-        self.retries = retries
-        self.closed = False
-
-    def budget(self, timeout: float | None) -> Budget:
-        """The time for one call."""
-        if self.closed:
-            raise RuntimeError("this client is closed")
-        return Budget(self.timeout if timeout is None else timeout)
+from cab_forecast.transport import Encoding
 
 
 class Client:
     """A blocking client, usable from several threads.
 
-    Overload, a draining server and lost connections are retried, other errors are not; a forecast
-    depends on nothing but its request, so that asking twice does no harm.
+    Overload, a draining server, a track memory that does not answer and lost connections are retried, other
+    errors are not. Asking twice does no harm: of one request the server remembers one thing.
     """
 
     def __init__(
@@ -85,8 +72,8 @@ class Client:
             ValueError: an argument is out of its range.
             OSError: the certificates cannot be read.
         """
-        self._settings = _Settings(endpoint, token, timeout, retries, encoding=encoding, ca_file=ca_file)
-        self._transport = _open(self._settings.connection)
+        self._settings = ClientSettings(endpoint, token, timeout, retries, encoding=encoding, ca_file=ca_file)
+        self._transport = open_transport(self._settings.connection)
 
     def predict(self, request: PredictRequest, timeout: float | None = None) -> PredictResponse:
         """Forecasts all agents of a scene.
@@ -120,7 +107,76 @@ class Client:
             ForecastError: there is no answer; its subclass says why.
             ValueError: the name is empty.
         """
-        return self._call(GET_MODEL, _get_model_request(name), timeout).model
+        return self._call(GET_MODEL, get_model_request(name), timeout).model
+
+    def agent_consistency(
+        self, scene_id: str, agent_id: str, window: float | None = None, timeout: float | None = None
+    ) -> list[InstantConsistency]:
+        """An agent's observations of the last seconds, and what was forecast for them; by ascending time.
+
+        Args:
+            scene_id: of the requests that it was in.
+            agent_id: as in those.
+            window: s back from its newest observation; None: 2 s.
+            timeout: s; None: the client's.
+
+        Raises:
+            UnknownTrack: the server remembers nothing of it.
+            TrackingUnavailable: its memory does not answer.
+            ForecastError: there is no answer; its subclass says why.
+        """
+        request = GetAgentConsistencyRequest(scene_id=scene_id, agent_id=agent_id, window=window or 0.0)
+        return list(self._call(GET_AGENT_CONSISTENCY, request, timeout).instants)
+
+    def scene_consistency(self, scene_id: str, timeout: float | None = None) -> GetSceneConsistencyResponse:
+        """The newest observation of every agent of a scene, and its sums by model.
+
+        Args:
+            scene_id: of the requests.
+            timeout: s; None: the client's.
+
+        Raises:
+            UnknownTrack: the server remembers nothing of it.
+            TrackingUnavailable: its memory does not answer.
+            ForecastError: there is no answer; its subclass says why.
+        """
+        return self._call(GET_SCENE_CONSISTENCY, GetSceneConsistencyRequest(scene_id=scene_id), timeout)
+
+    def model_consistency(self, timeout: float | None = None) -> list[ModelConsistency]:
+        """What was settled by model, over the life of the server's process.
+
+        Raises:
+            ForecastError: there is no answer; its subclass says why.
+        """
+        return list(self._call(LIST_MODEL_CONSISTENCY, ListModelConsistencyRequest(), timeout).models)
+
+    def reset_scene(self, scene_id: str, timeout: float | None = None) -> int:
+        """Makes the server forget a scene; how many agents it knew. (A retry finds none left.)
+
+        Raises:
+            TrackingUnavailable: its memory does not answer.
+            ForecastError: there is no answer; its subclass says why.
+        """
+        return self._call(RESET_SCENE, ResetSceneRequest(scene_id=scene_id), timeout).agents
+
+    def watch_scene(self, scene_id: str, timeout: float | None = None) -> Stream[WatchSceneResponse]:
+        """What is found out about a scene from now on, until the server drains or the stream is closed.
+
+        Args:
+            scene_id: of the requests.
+            timeout: s for it to begin; None: the client's. It goes on for as long as it likes.
+
+        Raises:
+            TrackingUnavailable: the server's memory does not answer.
+            Overloaded: too many watch.
+            ForecastError: it does not begin; its subclass says why. Later its iteration raises them.
+        """
+        budget = self._settings.budget(timeout)
+        request = WatchSceneRequest(scene_id=scene_id)
+        stream: Stream[WatchSceneResponse] = self._attempts(budget)(
+            self._transport.open, WATCH_SCENE, request, budget
+        )
+        return stream
 
     def close(self) -> None:
         """Frees the connections; calls after it raise RuntimeError."""
@@ -137,95 +193,10 @@ class Client:
 
     def _call(self, method: Method[Request, Response], request: Request, timeout: float | None) -> Response:
         budget = self._settings.budget(timeout)
-        attempts = tenacity.Retrying(
-            stop=stop(self._settings.retries, budget), wait=WAIT, retry=RETRY, reraise=True
-        )
-        answer: Response = attempts(self._transport.call, method, request, budget)
+        answer: Response = self._attempts(budget)(self._transport.call, method, request, budget)
         return answer
 
-
-class AsyncClient:
-    """``Client`` for asyncio: the same arguments, calls and errors; used within one event loop."""
-
-    def __init__(
-        self,
-        endpoint: str = DEFAULT_ENDPOINT,
-        token: str | None = None,
-        timeout: float = DEFAULT_TIMEOUT,
-        retries: int = DEFAULT_RETRIES,
-        *,
-        encoding: Encoding = "protobuf",
-        ca_file: str | PathLike[str] | None = None,
-    ) -> None:
-        """As ``Client``."""
-        self._settings = _Settings(endpoint, token, timeout, retries, encoding=encoding, ca_file=ca_file)
-        # Opened at the first call: a channel belongs to the event loop that it is made in.
-        self._transport: AsyncTransport | None = None
-
-    async def predict(self, request: PredictRequest, timeout: float | None = None) -> PredictResponse:  # noqa: ASYNC109 - it goes to the server, too
-        """As ``Client.predict``."""
-        return await self._call(PREDICT, request, timeout)
-
-    async def list_models(self, timeout: float | None = None) -> list[Model]:  # noqa: ASYNC109
-        """As ``Client.list_models``."""
-        return list((await self._call(LIST_MODELS, ListModelsRequest(), timeout)).models)
-
-    async def get_model(self, name: str, timeout: float | None = None) -> Model:  # noqa: ASYNC109
-        """As ``Client.get_model``."""
-        return (await self._call(GET_MODEL, _get_model_request(name), timeout)).model
-
-    async def close(self) -> None:
-        """As ``Client.close``."""
-        self._settings.closed = True
-        if self._transport is not None:
-            await self._transport.close()
-
-    async def __aenter__(self) -> Self:
-        return self
-
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        await self.close()
-
-    async def _call(
-        self,
-        method: Method[Request, Response],
-        request: Request,
-        timeout: float | None,  # noqa: ASYNC109
-    ) -> Response:
-        budget = self._settings.budget(timeout)
-        if self._transport is None:
-            self._transport = _open_async(self._settings.connection)
-        attempts = tenacity.AsyncRetrying(
+    def _attempts(self, budget: Budget) -> tenacity.Retrying:
+        return tenacity.Retrying(
             stop=stop(self._settings.retries, budget), wait=WAIT, retry=RETRY, reraise=True
         )
-        answer: Response = await attempts(self._transport.call, method, request, budget)
-        return answer
-
-
-def _open(connection: Connection) -> Transport:
-    # Imported here: whoever speaks one transport needs not load the other.
-    if connection.endpoint.transport == "grpc":
-        from cab_forecast.grpc_transport import GrpcTransport  # noqa: PLC0415
-
-        return GrpcTransport(connection)
-    from cab_forecast.rest_transport import RestTransport  # noqa: PLC0415
-
-    return RestTransport(connection)
-
-
-def _open_async(connection: Connection) -> AsyncTransport:
-    if connection.endpoint.transport == "grpc":
-        from cab_forecast.grpc_transport import AsyncGrpcTransport  # noqa: PLC0415
-
-        return AsyncGrpcTransport(connection)
-    from cab_forecast.rest_transport import AsyncRestTransport  # noqa: PLC0415
-
-    return AsyncRestTransport(connection)
-
-
-def _get_model_request(name: str) -> GetModelRequest:
-    if not name:
-        raise ValueError("the model's name is empty")
-    return GetModelRequest(name=name)

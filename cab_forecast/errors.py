@@ -70,9 +70,13 @@ class Unauthenticated(ForecastError):  # noqa: N818
 
 
 class NotFound(ForecastError):  # noqa: N818
-    """No such model."""
+    """No such model; ``UnknownTrack`` for scenes and agents."""
 
     default_code = "NOT_FOUND"
+
+
+class UnknownTrack(NotFound):
+    """The server remembers nothing of that scene or agent."""
 
 
 class TooLarge(ForecastError):  # noqa: N818
@@ -101,6 +105,10 @@ class Unavailable(ForecastError):  # noqa: N818
     retryable = True
 
 
+class TrackingUnavailable(Unavailable):
+    """The server's track memory does not answer; forecasts go on without it."""
+
+
 class InternalError(ForecastError):
     """The server failed, or its answer cannot be read."""
 
@@ -120,6 +128,12 @@ _BY_CODE: dict[str, type[ForecastError]] = {
     "INTERNAL": InternalError,
     "DATA_LOSS": InternalError,
 }
+_BY_REASON: dict[tuple[str, str], type[ForecastError]] = {
+    ("RESOURCE_EXHAUSTED", TOO_LARGE): TooLarge,
+    ("NOT_FOUND", "UNKNOWN_TRACK"): UnknownTrack,
+    ("UNAVAILABLE", "TRACKING_UNAVAILABLE"): TrackingUnavailable,
+}
+"""What is told apart from others of its code by its reason."""
 
 
 def error_for(
@@ -139,7 +153,5 @@ def error_for(
         field_violations: fields that were refused.
         retry_after: s.
     """
-    kind = _BY_CODE.get(code, ForecastError)
-    if kind is Overloaded and reason == TOO_LARGE:
-        kind = TooLarge
+    kind = _BY_REASON.get((code, reason)) or _BY_CODE.get(code, ForecastError)
     return kind(message, code=code, reason=reason, field_violations=field_violations, retry_after=retry_after)

@@ -7,6 +7,7 @@ from enum import StrEnum
 import numpy as np
 import numpy.typing as npt
 
+from cab.forecast.v1.consistency_service_pb2 import InstantConsistency, TrackingStatus
 from cab.forecast.v1.model_service_pb2 import ModelReference
 from cab.forecast.v1.prediction_service_pb2 import AgentForecast, ForecastStatus, PredictResponse
 
@@ -22,6 +23,19 @@ class Status(StrEnum):
     SHORT_HISTORY = "SHORT_HISTORY"
     FALLBACK = "FALLBACK"
     INVALID = "INVALID"
+
+
+class Tracking(StrEnum):
+    """What became of the server's memory of an agent or a scene in a call."""
+
+    UNSPECIFIED = "UNSPECIFIED"
+    """Not tracked, or something that this client does not know of yet."""
+    OK = "OK"
+    NEW = "NEW"
+    RESET = "RESET"
+    """What was remembered did not fit, or was gone."""
+    UNAVAILABLE = "UNAVAILABLE"
+    """The memory did not answer in time."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +71,11 @@ class Forecast:
     """Index of the mode of greatest weight."""
     samples: _Floats
     """[S, T, 2], m."""
+    tracking: Tracking
+    """What became of the memory of this agent."""
+    consistency: InstantConsistency | None
+    """What the model said before about the agent's newest observation; None: it was not asked for, or there
+    is nothing."""
 
     @property
     def most_likely(self) -> _Floats:
@@ -91,6 +110,14 @@ def forecasts(response: PredictResponse) -> dict[str, Forecast]:
     return found
 
 
+def tracking(answer: PredictResponse | AgentForecast) -> Tracking:
+    """What became of the memory of a call's scene, or of an agent in it."""
+    number = answer.tracking
+    # A newer server may know more of them.
+    name = TrackingStatus.Name(number) if number in TrackingStatus.values() else ""
+    return Tracking.__members__.get(name.removeprefix("TRACKING_STATUS_"), Tracking.UNSPECIFIED)
+
+
 def _forecast(entry: AgentForecast, response: PredictResponse) -> Forecast:
     steps, modes = response.steps, len(entry.weights)
     if modes and entry.most_likely_mode >= modes:
@@ -114,6 +141,8 @@ def _forecast(entry: AgentForecast, response: PredictResponse) -> Forecast:
         covariances=covariances[..., [0, 1, 1, 2]].reshape(modes, steps, 2, 2),
         most_likely_mode=entry.most_likely_mode,
         samples=_shaped(entry, "samples", entry.samples, (samples, steps, 2)),
+        tracking=tracking(entry),
+        consistency=entry.consistency if entry.HasField("consistency") else None,
     )
 
 

@@ -1,17 +1,22 @@
 """Calls over gRPC."""
 
-from collections.abc import Sequence
+import asyncio
+import threading
+from collections.abc import AsyncGenerator, Iterator, Sequence
+from typing import Any
 
 import grpc
-from google.protobuf.any_pb2 import Any
+from google.protobuf import any_pb2
 from google.protobuf.message import Message
 from google.rpc.error_details_pb2 import BadRequest, ErrorInfo, RetryInfo
 from grpc import aio
+from grpc.aio import EOF  # type: ignore[attr-defined]  # the stubs lack it
 from grpc_status import rpc_status
 
 from cab_forecast.endpoints import Endpoint
 from cab_forecast.errors import TOO_LARGE, UNREACHABLE, FieldViolation, ForecastError, error_for
 from cab_forecast.methods import Method, Request, Response
+from cab_forecast.streams import Opened, Stream
 from cab_forecast.timing import Budget
 from cab_forecast.transport import Connection
 
@@ -24,6 +29,10 @@ _OPTIONS: Sequence[tuple[str, int]] = (
     ("grpc.initial_reconnect_backoff_ms", 100),
     ("grpc.min_reconnect_backoff_ms", 100),
     ("grpc.max_reconnect_backoff_ms", 2000),
+    # While calls are open that say nothing for long, whether the server is still there is asked.
+    ("grpc.keepalive_time_ms", 20_000),
+    ("grpc.keepalive_timeout_ms", 20_000),
+    ("grpc.http2.max_pings_without_data", 0),
 )
 
 
@@ -48,6 +57,31 @@ class GrpcTransport:
         except grpc.RpcError as error:
             raise error_from_call(error, self._endpoint) from error
         return answer
+
+    def open(self, method: Method[Request, Response], request: Request, budget: Budget) -> Stream[Response]:
+        """As ``Transport.open``."""
+        invoke = self._channel.unary_stream(method.rpc, _serialize, method.response.FromString)
+        left = budget.remaining()  # the call itself has no deadline
+        # An iterator and a call, of which the stubs know the first
+        call: Any = invoke(request, metadata=self._metadata)
+        late = threading.Event()
+
+        def give_up() -> None:
+            late.set()
+            call.cancel()
+
+        timer = threading.Timer(left, give_up)  # nothing else bounds how long a message is waited for
+        timer.start()
+        try:
+            first = next(call, None)
+        except grpc.RpcError as error:
+            raise budget.exceeded() if late.is_set() else error_from_call(error, self._endpoint) from error
+        except BaseException:
+            call.cancel()
+            raise
+        finally:
+            timer.cancel()
+        return Stream(_messages(call, first, self._endpoint), call.cancel)
 
     def close(self) -> None:
         """As ``Transport.close``."""
@@ -76,9 +110,59 @@ class AsyncGrpcTransport:
             raise error_from_call(error, self._endpoint) from error
         return answer
 
+    async def open(
+        self, method: Method[Request, Response], request: Request, budget: Budget
+    ) -> Opened[Response]:
+        """As ``AsyncTransport.open``."""
+        invoke = self._channel.unary_stream(method.rpc, _serialize, method.response.FromString)
+        left = budget.remaining()
+        call = invoke(request, metadata=self._metadata)
+        try:
+            async with asyncio.timeout(left):
+                first = await call.read()
+        except aio.AioRpcError as error:
+            raise error_from_call(error, self._endpoint) from error
+        except TimeoutError as error:
+            call.cancel()
+            raise budget.exceeded() from error
+        except BaseException:
+            call.cancel()
+            raise
+
+        async def hang_up() -> None:
+            call.cancel()
+
+        return Opened(_async_messages(call, first, self._endpoint), hang_up)
+
     async def close(self) -> None:
         """As ``AsyncTransport.close``."""
         await self._channel.close(None)
+
+
+def _messages(call: Iterator[Response], first: Response | None, endpoint: Endpoint) -> Iterator[Response]:
+    """What the first message and those after it tell; an empty one tells that the call has begun."""
+    message = first
+    try:
+        while message is not None:
+            if message.ByteSize():
+                yield message
+            message = next(call, None)
+    except grpc.RpcError as error:
+        raise error_from_call(error, endpoint) from error
+
+
+async def _async_messages(
+    call: "aio.UnaryStreamCall[Request, Response]", first: Any, endpoint: Endpoint
+) -> AsyncGenerator[Response]:
+    """As ``_messages``."""
+    message = first
+    try:
+        while message is not EOF:
+            if message.ByteSize():
+                yield message
+            message = await call.read()
+    except aio.AioRpcError as error:
+        raise error_from_call(error, endpoint) from error
 
 
 def error_from_call(call: grpc.RpcError, endpoint: Endpoint) -> ForecastError:
@@ -111,7 +195,7 @@ def error_from_call(call: grpc.RpcError, endpoint: Endpoint) -> ForecastError:
     )
 
 
-def _details(call: grpc.RpcError) -> Sequence[Any]:
+def _details(call: grpc.RpcError) -> Sequence[any_pb2.Any]:
     try:
         status = rpc_status.from_call(call)  # type: ignore[arg-type] # what is raised is the call
     except ValueError:  # details that contradict the status: the status is what counts

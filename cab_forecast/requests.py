@@ -15,6 +15,8 @@ from cab.forecast.v1.model_service_pb2 import AgentType
 from cab.forecast.v1.prediction_service_pb2 import (
     CONTEXT_BLIND,
     CONTEXT_FULL,
+    HISTORY_SOURCE_MEMORY,
+    HISTORY_SOURCE_UNSPECIFIED,
     Agent,
     AgentState,
     MapPatch,
@@ -25,6 +27,7 @@ from cab.forecast.v1.prediction_service_pb2 import (
 from cab_forecast.layers import ImageEncoding, as_layers, encode_layers
 
 TypeName = Literal["vehicle", "pedestrian", "cyclist", "unknown"]
+History = Literal["request", "memory"]
 
 PATCH_PIXELS = 100
 """Rows and columns of an agent's own map patch."""
@@ -148,13 +151,16 @@ def predict_request(
     horizon: float | None = None,
     blind: bool = False,
     strict: bool = False,
+    history: History = "request",
+    consistency: bool = False,
 ) -> PredictRequest:
     """A request for one scene at one time.
 
     Args:
         time: the present, s since the epoch.
         agents: see ``agent``.
-        scene_id: names the scene for a server that remembers agents.
+        scene_id: names the scene; the server remembers its agents, each by its id, and judges its forecasts
+            by what comes after them.
         model: ``name`` or ``name@version``; empty: the server's default.
         raster: see ``scene_raster``.
         max_modes: return so many of the likeliest modes only; 0: all.
@@ -163,10 +169,15 @@ def predict_request(
         horizon: s, a multiple of 0.5; None: the model's.
         blind: forecast each agent from its own history alone, without map and neighbours.
         strict: let any agent's fault fail the whole call.
+        history: where earlier observations come from: the request alone, or what the server remembers, too,
+            so that the request needs to hold only what is new. The latter needs a scene_id.
+        consistency: return the latest consistency of each agent. Needs a scene_id.
 
     Raises:
-        ValueError: a count or seed that is negative or beyond 32 bits.
+        ValueError: a count or seed that is negative or beyond 32 bits, or another history.
     """
+    if history not in get_args(History):
+        raise ValueError(f"history must be one of {', '.join(get_args(History))}, not {history!r}")
     return PredictRequest(
         time=time,
         agents=agents,
@@ -180,6 +191,9 @@ def predict_request(
             horizon=horizon,
             context=CONTEXT_BLIND if blind else CONTEXT_FULL,
             strict=strict,
+            # What is the default goes unsaid, so that servers that do not know of it understand
+            history=HISTORY_SOURCE_MEMORY if history == "memory" else HISTORY_SOURCE_UNSPECIFIED,
+            consistency=consistency,
         ),
     )
 

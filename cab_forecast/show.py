@@ -1,6 +1,6 @@
 """Forecasts as a table in the terminal."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from rich.console import Console
@@ -9,12 +9,11 @@ from rich.measure import Measurement
 from rich.table import Table
 
 from cab.forecast.v1.prediction_service_pb2 import PredictRequest, PredictResponse
-from cab_forecast.forecast import Forecast, Status, forecasts
+from cab_forecast.forecast import Forecast, Status, Tracking, forecasts, tracking
 from cab_forecast.names import model_name, protocol_name, type_name
+from cab_forecast.terminal import UNBOUNDED, unfolded
 
 _HORIZONS = (1.0, 3.0, 6.0)
-_UNBOUNDED = 10_000
-"""Columns; wider than any table."""
 _STYLES = {
     Status.UNSPECIFIED: "magenta",
     Status.OK: "green",
@@ -37,17 +36,26 @@ def print_forecasts(
     Raises:
         ValueError: sizes in the response contradict each other.
     """
-    console = console or Console()
-    if not console.is_terminal:  # a file or a pipe has no width
-        console = Console(file=console.file, width=_UNBOUNDED)
+    console = unfolded(console)
     views = list(forecasts(response).values())
     console.print(_fitting_table(views, response, request, console))
     for view in views:
         if view.status is not Status.OK:
             console.print(_note(view, response), highlight=False, soft_wrap=True)
     console.print(f"[dim]{escape(_origin(response))}[/]", highlight=False, soft_wrap=True)
-    for warning in response.warnings:
+    for warning in (*response.warnings, *_memory_warnings(response, views)):
         console.print(f"[yellow]warning: {escape(warning)}[/]", highlight=False, soft_wrap=True)
+
+
+def _memory_warnings(response: PredictResponse, views: Sequence[Forecast]) -> Iterator[str]:
+    """What a user must know of the track memory."""
+    if tracking(response) is Tracking.UNAVAILABLE:
+        yield "the track memory did not answer in time: nothing was recalled"
+    if tracking(response) is Tracking.RESET:
+        yield "what the server remembered of the scene is gone"
+    again = [view.agent_id for view in views if view.tracking is Tracking.RESET]
+    if again:
+        yield f"what was remembered did not fit, and begins anew: {', '.join(again)}"
 
 
 def _fitting_table(
@@ -64,7 +72,7 @@ def _fitting_table(
 
 def _width(table: Table, console: Console) -> int:
     """Columns that the table takes unfolded."""
-    return Measurement.get(console, console.options.update(width=_UNBOUNDED), table).maximum
+    return Measurement.get(console, console.options.update(width=UNBOUNDED), table).maximum
 
 
 def _table(
@@ -142,4 +150,6 @@ def _origin(response: PredictResponse) -> str:
         f"inference {timing.inference * 1e3:.1f} ms",
         f"batch of {timing.batch_agents} agents",
     ]
+    if response.tracking:
+        parts.append(f"track memory {tracking(response).lower()}, {timing.tracking * 1e3:.1f} ms")
     return " · ".join(parts)

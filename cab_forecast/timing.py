@@ -44,8 +44,12 @@ class Budget(Mapping[str, float]):
         """
         left = self._end - time.monotonic()
         if left <= 0:
-            raise DeadlineExceeded(f"no answer within {self.timeout:g} s")
+            raise self.exceeded()
         return left
+
+    def exceeded(self) -> DeadlineExceeded:
+        """The error for a call that took longer."""
+        return DeadlineExceeded(f"no answer within {self.timeout:g} s")
 
     def __getitem__(self, phase: str) -> float:
         return self.remaining()
@@ -55,6 +59,29 @@ class Budget(Mapping[str, float]):
 
     def __len__(self) -> int:
         return 4
+
+
+class StreamTimes(Mapping[str, float]):
+    """What httpx may wait for a stream: the budget until it has begun, from then on so long for each read."""
+
+    def __init__(self, budget: Budget, silence: float) -> None:
+        """
+        Args:
+            budget: of beginning.
+            silence: s without a byte from the server after which the connection is taken for lost.
+        """
+        self._budget = budget
+        self._silence = silence
+        self.begun = False
+
+    def __getitem__(self, phase: str) -> float:
+        return self._silence if self.begun else self._budget[phase]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._budget)
+
+    def __len__(self) -> int:
+        return len(self._budget)
 
 
 class _WaitAsTold(wait_base):

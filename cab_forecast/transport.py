@@ -6,6 +6,7 @@ from typing import Literal, Protocol
 
 from cab_forecast.endpoints import Endpoint
 from cab_forecast.methods import Method, Request, Response
+from cab_forecast.streams import Opened, Stream
 from cab_forecast.timing import Budget
 
 Encoding = Literal["protobuf", "json"]
@@ -34,6 +35,15 @@ class Transport(Protocol):
         """
         ...
 
+    def open(self, method: Method[Request, Response], request: Request, budget: Budget) -> Stream[Response]:
+        """Sends the request and waits until the server has begun to answer; the messages come in their own
+        time.
+
+        Raises:
+            ForecastError: it has not.
+        """
+        ...
+
     def close(self) -> None:
         """Frees the connections."""
         ...
@@ -44,6 +54,12 @@ class AsyncTransport(Protocol):
 
     async def call(self, method: Method[Request, Response], request: Request, budget: Budget) -> Response:
         """As ``Transport.call``."""
+        ...
+
+    async def open(
+        self, method: Method[Request, Response], request: Request, budget: Budget
+    ) -> Opened[Response]:
+        """As ``Transport.open``."""
         ...
 
     async def close(self) -> None:

@@ -4,6 +4,11 @@ from dataclasses import dataclass, fields
 
 from model.arrays import Bools, Floats, Ints
 
+MAX_SPEED = 100.0
+"""m/s; successive observations further apart than this allows are not of one agent."""
+JUMP_SLACK = 5.0
+"""m; beyond what the speed allows: detections jitter, and short intervals magnify it."""
+
 
 @dataclass(frozen=True)
 class Observations:

@@ -72,6 +72,11 @@ def resample(observations: Observations, time: float, frames: int) -> AgentState
     return replace(states, velocity_known=known).last_frames(frames)
 
 
+def history_seconds(frames: int) -> float:
+    """How far before the present ``resample`` looks for so many frames, s."""
+    return (frames + _EXTRA_FRAMES - 1) * STEP_SECONDS + MAX_AGE + MAX_GAP
+
+
 def _grid(ends: Floats, frames: int) -> Floats:
     """Each agent's grid times [N, frames], which end at ``ends`` [N]."""
     return ends[:, None] - STEP_SECONDS * np.arange(frames - 1, -1, -1, dtype=np.float64)

@@ -91,6 +91,15 @@ class UnknownModel(ServiceError):
     title = "Unknown model"
 
 
+class UnknownTrack(ServiceError):
+    """Nothing is remembered of that scene or agent."""
+
+    code = "NOT_FOUND"
+    http_status = 404
+    reason = "UNKNOWN_TRACK"
+    title = "Not remembered"
+
+
 class TooLarge(ServiceError):
     """The request exceeds a size limit; another try would fail the same way."""
 
@@ -128,6 +137,18 @@ class Unavailable(ServiceError):
     http_status = 503
     reason = "UNAVAILABLE"
     title = "Not ready"
+
+    def __init__(self, detail: str, retry_after: float = 1.0) -> None:
+        super().__init__(detail, retry_after=retry_after)
+
+
+class TrackingUnavailable(ServiceError):
+    """The track memory does not answer. Forecasts go on without it; this is for calls that are about it."""
+
+    code = "UNAVAILABLE"
+    http_status = 503
+    reason = "TRACKING_UNAVAILABLE"
+    title = "Track memory not available"
 
     def __init__(self, detail: str, retry_after: float = 1.0) -> None:
         super().__init__(detail, retry_after=retry_after)
@@ -180,10 +201,12 @@ TABLE: tuple[type[ServiceError], ...] = (
     BadFields,
     Unauthenticated,
     UnknownModel,
+    UnknownTrack,
     TooLarge,
     Overloaded,
     DeadlineExceeded,
     Unavailable,
+    TrackingUnavailable,
     Internal,
     NotFound,
     MethodNotAllowed,

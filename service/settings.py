@@ -16,6 +16,7 @@ from pydantic_settings import (
 )
 
 from service.environment import CONFIG, PREFIX, unknown_variable
+from service.history.address import parse_address
 
 FALLBACK_MODEL = "constant-velocity-yaw"
 """The model of agents that the model asked for cannot forecast."""
@@ -34,9 +35,20 @@ class Settings(BaseSettings):
     """HOST:PORT of REST; port 0 takes a free one."""
     grpc: str = "127.0.0.1:50051"
     """HOST:PORT of gRPC; port 0 takes a free one."""
-    store: str = "memory"
-    """Where agents are remembered. Only "memory" in this release, which remembers nothing yet: each
-    request carries its agents' histories until track memory lands."""
+    store: str = Field(default="memory", repr=False)
+    """Where agents are remembered: "memory", in this process, or Redis 7 (see ``service.history.address``):
+    redis:// and rediss:// of one server, redis+sentinel:// and redis+cluster://."""
+    store_budget_ms: float = Field(default=20.0, gt=0)
+    """ms that a call waits for the track memory; later the forecast goes out without it."""
+    store_timeout_ms: float = Field(default=500.0, gt=0)
+    """ms after which Redis is taken not to answer at all."""
+    store_connections: int = Field(default=16, ge=1)
+    """Connections to each Redis server at most."""
+    track_expiry: float = Field(default=30.0, ge=10.0)
+    """s without a call of a scene after which it is forgotten."""
+    max_tracked_agents: int = Field(default=20_000, ge=1)
+    """Agents that this process has in memory; beyond it the scenes without a call for the longest time go.
+    With Redis they are read again when they are called for."""
     models: Path | None = None
     """Folder of checkpoints; None: the bundled ones, if any."""
     default_model: str | None = None
@@ -84,7 +96,7 @@ class Settings(BaseSettings):
     @classmethod
     def _is_known_store(cls, value: str) -> str:
         if value != "memory":
-            raise ValueError(f'"{value}" is not supported: this release has "memory" only')
+            parse_address(value)
         return value
 
     @field_validator("api_tokens", mode="before")

@@ -23,10 +23,7 @@ def real_request(
         scene: "scene-0103", say.
         frame: None: the frame with the most vehicles that have a whole history.
     """
-    rows = [line.split() for line in (data / f"label/{split}/{scene}.txt").read_text().splitlines()]
-    tracks: dict[str, dict[int, tuple[float, float, float]]] = {}
-    for row in rows:
-        tracks.setdefault(row[1], {})[int(float(row[0]))] = (float(row[X]), float(row[Y]), float(row[YAW]))
+    tracks = real_tracks(data / f"label/{split}/{scene}.txt")
 
     def whole(at: int) -> int:
         return sum(all(at - k in track for k in range(history)) for track in tracks.values())
@@ -45,6 +42,15 @@ def real_request(
             x, y, yaw = track[f]
             agent.states.add(time=f * STEP, x=x, y=y, heading=yaw)
     return request
+
+
+def real_tracks(labels: Path) -> dict[str, dict[int, tuple[float, float, float]]]:
+    """x, y (m) and heading (rad) of a scene's vehicles by frame."""
+    tracks: dict[str, dict[int, tuple[float, float, float]]] = {}
+    for line in labels.read_text().splitlines():
+        row = line.split()
+        tracks.setdefault(row[1], {})[int(float(row[0]))] = (float(row[X]), float(row[Y]), float(row[YAW]))
+    return tracks
 
 
 def real_raster(data: Path, scene: str) -> pb.SceneRaster:

@@ -9,6 +9,7 @@ import typer
 
 from cab_forecast.endpoints import DEFAULT_ENDPOINT
 from service.cli.failures import fail
+from service.cli.options import Endpoint, Token
 
 _SAMPLES = 2000
 
@@ -29,12 +30,8 @@ def benchmark(
         typer.Option(file_okay=False, help="Folder for answers and report; an interrupted run goes on."),
     ] = None,
     *,
-    endpoint: Annotated[
-        str, typer.Option(envvar="CAB_FORECAST_ENDPOINT", help="grpc://, grpcs://, http:// or https://")
-    ] = DEFAULT_ENDPOINT,
-    token: Annotated[
-        str | None, typer.Option(envvar="CAB_FORECAST_TOKEN", help="Bearer token of the server.")
-    ] = None,
+    endpoint: Endpoint = DEFAULT_ENDPOINT,
+    token: Token = None,
     split: Annotated[str, typer.Option(help="Split to ask about.")] = "train_val",
     protocol: Annotated[
         str, typer.Option(help="Of the inputs: causal, or paper to compare with published tables.")

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli import benchmark, convert, evaluate, predict, serve, train
+from service.cli import benchmark, consistency, convert, evaluate, predict, serve, train
 
 app = typer.Typer(
     name="cab-forecast",
@@ -32,6 +32,7 @@ def _options(
 
 serve.register(app)
 predict.register(app)
+consistency.register(app)
 convert.register(app)
 train.register(app)
 evaluate.register(app)

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from cab_forecast.endpoints import DEFAULT_ENDPOINT
+from service.cli.options import DEFAULT_TIMEOUT, AsJson, Endpoint, Timeout, Token
 
 _MOST = 2**32 - 1
 
@@ -24,13 +25,9 @@ def predict(
         ),
     ],
     *,
-    endpoint: Annotated[
-        str, typer.Option(envvar="CAB_FORECAST_ENDPOINT", help="grpc://, grpcs://, http:// or https://")
-    ] = DEFAULT_ENDPOINT,
-    token: Annotated[
-        str | None, typer.Option(envvar="CAB_FORECAST_TOKEN", help="Bearer token of the server.")
-    ] = None,
-    timeout: Annotated[float, typer.Option(help="Seconds to wait, retries included.")] = 5.0,
+    endpoint: Endpoint = DEFAULT_ENDPOINT,
+    token: Token = None,
+    timeout: Timeout = DEFAULT_TIMEOUT,
     model: Annotated[str | None, typer.Option(help="name or name@version.")] = None,
     samples: Annotated[
         int | None, typer.Option(min=0, max=_MOST, help="Trajectories to draw an agent.")
@@ -48,9 +45,7 @@ def predict(
     output: Annotated[
         Path | None, typer.Option(dir_okay=False, help="Write the answer as .json or .binpb.")
     ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print the answer as JSON, not as a table.")
-    ] = False,
+    as_json: AsJson = False,
     save_request: Annotated[
         Path | None,
         typer.Option(dir_okay=False, help="Write the request as .json or .binpb instead of sending it."),
@@ -58,7 +53,8 @@ def predict(
 ) -> None:
     """Send one request and show its forecasts; options given here replace those in the request."""
     # Imported here, as in all commands: --help must not wait for it.
-    from service.cli.prediction import Changes, Outputs, Server, run  # noqa: PLC0415
+    from service.cli.asking import Server  # noqa: PLC0415
+    from service.cli.prediction import Changes, Outputs, run  # noqa: PLC0415
 
     changes = Changes(
         model=model,

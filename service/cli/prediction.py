@@ -6,10 +6,9 @@ from pathlib import Path
 import typer
 
 from cab.forecast.v1.prediction_service_pb2 import CONTEXT_BLIND, PredictRequest, PredictResponse
-from cab_forecast.client import Client
 from cab_forecast.demo import demo_request
-from cab_forecast.errors import UNREACHABLE, ForecastError, Unauthenticated
 from cab_forecast.show import print_forecasts
+from service.cli.asking import Server, asking
 from service.cli.failures import fail
 from service.cli.messages import read_message, to_json, write_message
 
@@ -41,16 +40,6 @@ class Changes:
             request.options.context = CONTEXT_BLIND
         if self.strict:
             request.options.strict = True
-
-
-@dataclass(frozen=True)
-class Server:
-    """Whom to ask."""
-
-    endpoint: str
-    token: str | None
-    timeout: float
-    """s."""
 
 
 @dataclass(frozen=True)
@@ -108,19 +97,8 @@ def run(
             write_message(save_request, request)
             return
         outputs.prepare()
-        with Client(server.endpoint, server.token, server.timeout) as client:
+        with asking(server) as client:
             response = client.predict(request)
         outputs.write(request, response)
-    except ForecastError as error:
-        fail(f"{error}{_hint(error)}")
     except (OSError, ValueError, ModuleNotFoundError) as error:
         fail(str(error))
-
-
-def _hint(error: ForecastError) -> str:
-    """What to do about it, where that is plain."""
-    if error.reason == UNREACHABLE:
-        return " (is a server running there? start one with: cab-forecast serve)"
-    if isinstance(error, Unauthenticated):
-        return " (give the server's token with --token or CAB_FORECAST_TOKEN)"
-    return ""

@@ -22,7 +22,11 @@ def serve(
     http: Annotated[str | None, typer.Option(help="HOST:PORT of REST. [default: 127.0.0.1:8080]")] = None,
     grpc: Annotated[str | None, typer.Option(help="HOST:PORT of gRPC. [default: 127.0.0.1:50051]")] = None,
     store: Annotated[
-        str | None, typer.Option(help='Where agents are remembered; "memory" only, in this release.')
+        str | None,
+        typer.Option(
+            help="Where agents are remembered: memory, redis://…, redis+sentinel://…, redis+cluster://… "
+            "[default: memory]"
+        ),
     ] = None,
     models: Annotated[
         Path | None, typer.Option(help="Folder of checkpoints. [default: the bundled ones]")

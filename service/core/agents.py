@@ -16,20 +16,17 @@ from google.protobuf.descriptor import FieldDescriptor
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.arrays import Bools, Bytes, Float32s, Floats, Ints
-from model.observations import Observations
+from model.observations import JUMP_SLACK, MAX_SPEED, Observations
 from model.resample import MAX_AGE, TIME_TOLERANCE
 from model.scene import AgentType
 from service.core.images import decode_layers
-from service.core.options import MAX_ID_LENGTH, MAX_POSITION, MAX_TIME
+from service.core.options import MAX_POSITION, MAX_TIME
 from service.errors import BadField, Fault
+from service.limits import MAX_ID_LENGTH
 from service.settings import Settings
 
 PATCH_PIXELS = 100
 """Rows and columns of an agent's own map patch."""
-MAX_SPEED = 100.0
-"""m/s; successive observations further apart than this allows are not of one agent."""
-JUMP_SLACK = 5.0
-"""m; beyond what the speed allows: detections jitter, and short intervals magnify it."""
 
 TYPES = {
     models_pb.AGENT_TYPE_VEHICLE: AgentType.VEHICLE,

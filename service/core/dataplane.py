@@ -6,7 +6,7 @@ import secrets
 import time
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import TypeVar
@@ -17,16 +17,26 @@ import torch
 
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
+from model.forecaster import Forecaster
+from model.resample import history_seconds
+from service.consistency.plane import ConsistencyPlane
+from service.consistency.tracker import Tracked, Tracker
+from service.core.agents import Agents, read_agents
 from service.core.batcher import Admission, Batcher, Outcome
-from service.core.catalog import Catalog, Models, build_catalog
+from service.core.catalog import Catalog, Models, build_catalog, reference
 from service.core.encode import Result, encode, finite
 from service.core.incoming import Encoded, Reader
-from service.core.options import read_options
-from service.core.plan import Draft, Group, Plan, check_strict, fall_back, make_plan
+from service.core.options import Options, read_options
+from service.core.plan import Draft, Group, Plan, check_strict, fall_back, frames_of, make_plan
 from service.core.threads import set_helper_threads
+from service.core.tracking import observed, report, sightings, with_histories
 from service.core.warmup import warm_up
-from service.errors import BadField, DeadlineExceeded, Fault, Unavailable
+from service.errors import BadField, DeadlineExceeded, Fault, Unavailable, UnknownModel
+from service.history.guard import Guard
+from service.history.store import Sighting
+from service.history.stores import make_store
 from service.settings import Settings
+from service.telemetry.consistency import ConsistencyCollector, StoreMetrics
 from service.telemetry.metrics import Metrics
 
 _log = structlog.get_logger(__name__)
@@ -85,6 +95,15 @@ class DataPlane:
             initializer=set_helper_threads,
         )
         self._reader = Reader(self._threads)
+        self._store = make_store(settings)
+        store_metrics = StoreMetrics(metrics.registry)
+        self._guard = Guard(store_metrics.observe, store_metrics.failed)
+        self._tracker = Tracker(self._store, self._guard, settings.store_budget_ms / 1000, self._reference_of)
+        metrics.registry.register(ConsistencyCollector(self._tracker.sums))
+        self.consistency = ConsistencyPlane(
+            self._store, self._guard, self._tracker.sums, self._reference_of, self._require_ready
+        )
+        """The calls about consistency."""
         self._phase = Phase.STARTING
         self._calls = 0
         self._idle = asyncio.Event()
@@ -105,6 +124,7 @@ class DataPlane:
             SettingsError: a model that is needed is not there.
             Exception: whatever ``load`` raises.
         """
+        await self._store.open()
         models = await self._in_thread(load)
         catalog = build_catalog(models, self._settings.default_model)
         self._batcher.start()
@@ -115,8 +135,9 @@ class DataPlane:
             self._phase = Phase.READY
 
     def refuse(self) -> None:
-        """No more calls; those accepted go on."""
+        """No more calls; those accepted go on, but for those that watch."""
         self._phase = Phase.DRAINING
+        self.consistency.end_watching()
 
     async def drain(self, seconds: float) -> bool:
         """Waits until the answers of all accepted calls are out, so long at most; whether they are."""
@@ -132,6 +153,8 @@ class DataPlane:
         """Stops the threads."""
         self.refuse()
         await self._batcher.stop()
+        await self._guard.close()
+        await self._store.close()
         await asyncio.to_thread(self._threads.shutdown, cancel_futures=True)
 
     @contextmanager
@@ -207,15 +230,46 @@ class DataPlane:
         catalog = call.catalog
         forecaster = catalog.get(request.model)
         options = read_options(request, forecaster.info, self._settings)
+        before: Tracked | None = None
+        agents: Agents | None = None
         with self._batcher.admit(options.predicted, accepted) as admission:
-            plan = await self._in_thread(make_plan, request, options, forecaster, catalog, self._settings)
+            if options.recalls:
+                agents, before = await self._recall(request, options, forecaster, catalog)
+            plan = await self._in_thread(
+                make_plan, request, options, forecaster, catalog, self._settings, agents
+            )
             results, outcomes = await self._forecast(plan, call.deadline, admission)
         seed = 0
         if options.samples:
             seed = secrets.randbits(32) if options.seed is None else options.seed
-        response = await self._in_thread(encode, plan, results, outcomes, seed)
+        encoding = self._in_thread(encode, plan, results, outcomes, seed)
+        if not options.scene_id:
+            response = await encoding
+        else:
+            brought = sightings(plan, results)
+            # The memory's answer mostly comes while this one is put together
+            response, after = await asyncio.gather(encoding, self._remember(options, brought))
+            report(response, before, after)
         self._count_agents(plan)
         return response
+
+    async def _recall(
+        self, request: pb.PredictRequest, options: Options, forecaster: Forecaster, catalog: Catalog
+    ) -> tuple[Agents, Tracked]:
+        """The agents, with what the memory knows of them."""
+        agents = await self._in_thread(read_agents, request, self._settings)
+        tracked = await self._tracker.exchange(
+            options.scene_id,
+            options.time,
+            observed(agents, (forecaster, catalog.fallback)),
+            recall=history_seconds(frames_of(forecaster, catalog)),
+            latest=options.consistency,
+        )
+        return with_histories(agents, tracked.histories), tracked
+
+    async def _remember(self, options: Options, brought: Sequence[Sighting]) -> Tracked:
+        latest = options.consistency and not options.recalls
+        return await self._tracker.exchange(options.scene_id, options.time, brought, latest=latest)
 
     async def _forecast(
         self, plan: Plan, deadline: float, admission: Admission
@@ -256,6 +310,14 @@ class DataPlane:
         for draft in plan.drafts:
             status = pb.ForecastStatus.Name(draft.status).removeprefix("FORECAST_STATUS_").lower()
             self._metrics.agents.labels(name, status).inc()
+
+    def _reference_of(self, series: str) -> models_pb.ModelReference:
+        """The model that name@version names; it may be loaded on another server only."""
+        if self._catalog is not None:
+            with suppress(UnknownModel):
+                return reference(self._catalog.get(series).info)
+        name, _, version = series.partition("@")
+        return models_pb.ModelReference(name=name, version=version)
 
     def _require_ready(self) -> Catalog:
         if self._catalog is None or self._phase is not Phase.READY:

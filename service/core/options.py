@@ -10,10 +10,9 @@ from model.forecaster import Context, ModelInfo
 from model.scene import STEP_SECONDS, Raster
 from service.core.images import decode_layers
 from service.errors import BadField, TooLarge
+from service.limits import MAX_ID_LENGTH
 from service.settings import Settings
 
-MAX_ID_LENGTH = 128
-"""Characters of an agent's or a scene's id."""
 MAX_TIME = 1e10
 """s since the epoch, either way."""
 MAX_POSITION = 1e7
@@ -23,6 +22,11 @@ _CONTEXTS = {
     pb.CONTEXT_UNSPECIFIED: Context.FULL,
     pb.CONTEXT_FULL: Context.FULL,
     pb.CONTEXT_BLIND: Context.BLIND,
+}
+_RECALLS = {
+    pb.HISTORY_SOURCE_UNSPECIFIED: False,
+    pb.HISTORY_SOURCE_REQUEST: False,
+    pb.HISTORY_SOURCE_MEMORY: True,
 }
 
 
@@ -41,6 +45,12 @@ class Options:
     strict: bool
     predicted: int
     """Agents that want a forecast."""
+    scene_id: str
+    """Empty: the call is not tracked."""
+    recalls: bool
+    """Whether histories come from the track memory as well."""
+    consistency: bool
+    """Whether each agent's latest consistency is wanted."""
 
 
 def read_options(request: pb.PredictRequest, info: ModelInfo, settings: Settings) -> Options:
@@ -69,6 +79,12 @@ def read_options(request: pb.PredictRequest, info: ModelInfo, settings: Settings
         raise BadField("options.context", f"unknown value {options.context}")
     if context is Context.BLIND and not info.supports_blind:
         raise BadField("options.context", f"{info.name} has no blind forecast")
+    if options.history not in _RECALLS:
+        raise BadField("options.history", f"unknown value {options.history}")
+    recalls = _RECALLS[options.history]
+    for name, asked in (("history", recalls), ("consistency", options.consistency)):
+        if asked and not request.scene_id:
+            raise BadField(f"options.{name}", "needs a scene_id")
     predicted = sum(not agent.HasField("predict") or agent.predict for agent in request.agents)
     if options.samples > settings.max_samples:
         raise BadField("options.samples", f"at most {settings.max_samples}")
@@ -86,6 +102,9 @@ def read_options(request: pb.PredictRequest, info: ModelInfo, settings: Settings
         seed=options.seed if options.HasField("seed") else None,
         strict=options.strict,
         predicted=predicted,
+        scene_id=request.scene_id,
+        recalls=recalls,
+        consistency=options.consistency,
     )
 
 

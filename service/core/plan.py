@@ -57,6 +57,7 @@ class Plan:
     """A call, decoded: what is to be run, and what is to be answered."""
 
     options: Options
+    agents: Agents
     forecaster: Forecaster
     """The one that was asked for."""
     fallback: Forecaster
@@ -97,7 +98,12 @@ class Plan:
 
 
 def make_plan(
-    request: pb.PredictRequest, options: Options, forecaster: Forecaster, catalog: Catalog, settings: Settings
+    request: pb.PredictRequest,
+    options: Options,
+    forecaster: Forecaster,
+    catalog: Catalog,
+    settings: Settings,
+    agents: Agents | None = None,
 ) -> Plan:
     """Decodes a request and prepares its forwards. Takes milliseconds: not for the event loop.
 
@@ -107,14 +113,16 @@ def make_plan(
         forecaster: the one asked for.
         catalog: where the fallback comes from.
         settings: the limits.
+        agents: of the request, if they were read already.
 
     Raises:
         BadField: the map is wrong.
         BadFields: the call is strict, and an agent cannot be forecast as asked.
     """
     raster = read_raster(request, settings)
-    agents = read_agents(request, settings)
-    frames = max(forecaster.info.history_frames, catalog.fallback.info.history_frames)
+    if agents is None:
+        agents = read_agents(request, settings)
+    frames = frames_of(forecaster, catalog)
     scene, rows, faults = _build_scene(request, agents, frames, raster)
     models = forecaster, catalog.fallback
     drafts = []
@@ -125,11 +133,16 @@ def make_plan(
             drafts.append(draft)
         elif agents.predict[index] and scene is not None:
             drafts.append(_assign(index, agent_id, scene, rows[index], models))
-    plan = Plan(options, forecaster, catalog.fallback, scene, drafts, [])
+    plan = Plan(options, agents, forecaster, catalog.fallback, scene, drafts, [])
     check_strict(plan)
     plan.warnings.extend(_warnings(plan))
     plan.add_groups(draft for draft in drafts if draft.forecaster is not None)
     return plan
+
+
+def frames_of(forecaster: Forecaster, catalog: Catalog) -> int:
+    """Frames of history that a call may use."""
+    return max(forecaster.info.history_frames, catalog.fallback.info.history_frames)
 
 
 def check_strict(plan: Plan) -> None:

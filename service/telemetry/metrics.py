@@ -92,15 +92,22 @@ class Metrics:
             self.model_info.labels(info.name, info.version, info.protocol.value, is_default).set(1)
 
     @contextmanager
-    def call(self, transport: str, method: str) -> Iterator["Call"]:
-        """Counts one call and times it; its code is what the caller of this puts into it."""
+    def call(self, transport: str, method: str, timed: bool = True) -> Iterator["Call"]:
+        """Counts one call and times it; its code is what the caller of this puts into it.
+
+        Args:
+            transport: "grpc" or "rest".
+            method: of the contract.
+            timed: False for one that lasts as long as the client likes.
+        """
         call = Call()
         started = perf_counter()
         try:
             yield call
         finally:
             self.requests.labels(transport, method, call.code).inc()
-            self.request_duration.labels(transport, method).observe(perf_counter() - started)
+            if timed:
+                self.request_duration.labels(transport, method).observe(perf_counter() - started)
 
     def render(self) -> bytes:
         """The text that Prometheus reads."""

@@ -247,16 +247,28 @@ def http_fake(
 @contextmanager
 def trickling_server() -> Iterator[str]:
     """An HTTP server that answers at once, and then sends the body byte by byte; yields ``host:port``."""
-    over = threading.Event()
     head = f"HTTP/1.1 200 OK\r\ncontent-type: {PROTOBUF}\r\ncontent-length: 400\r\n\r\n"
+    with raw_server(head.encode(), b"\0") as address:
+        yield address
+
+
+@contextmanager
+def raw_server(head: bytes, drip: bytes | None) -> Iterator[str]:
+    """A server of one connection; yields ``host:port``.
+
+    Args:
+        head: what it says to whatever comes first.
+        drip: what it says again and again from then on; None: it hangs up.
+    """
+    over = threading.Event()
 
     def serve(listener: socket.socket) -> None:
         connection, _ = listener.accept()
         with connection, suppress(ConnectionError):
             connection.recv(2**16)
-            connection.sendall(head.encode())
-            while not over.wait(0.05):
-                connection.sendall(b"\0")
+            connection.sendall(head)
+            while drip is not None and not over.wait(0.05):
+                connection.sendall(drip)
 
     with socket.create_server(("127.0.0.1", 0)) as listener:
         thread = threading.Thread(target=serve, args=(listener,))

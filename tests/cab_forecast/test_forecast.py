@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from cab.forecast.v1.consistency_service_pb2 import TRACKING_STATUS_RESET, TRACKING_STATUS_UNAVAILABLE
 from cab.forecast.v1.prediction_service_pb2 import FORECAST_STATUS_INVALID, PredictResponse
-from cab_forecast import Status, demo_request, forecasts
+from cab_forecast import Status, Tracking, demo_request, forecasts, tracking
 from tests.cab_forecast.answers import MODEL, TURN_RATES, WEIGHTS, answer
 
 
@@ -53,6 +54,23 @@ def test_a_second_report_on_an_id_does_not_hide_the_first(response: PredictRespo
 def test_a_status_of_the_future(response: PredictResponse) -> None:
     response.forecasts[0].status = 99  # type: ignore[assignment]
     assert forecasts(response)["car-straight"].status is Status.UNSPECIFIED
+
+
+def test_tracking_and_consistency(response: PredictResponse) -> None:
+    entry = response.forecasts[0]
+    view = forecasts(response)["car-straight"]
+    assert (view.tracking, view.consistency) == (Tracking.UNSPECIFIED, None)
+    assert tracking(response) is Tracking.UNSPECIFIED
+    response.tracking = TRACKING_STATUS_UNAVAILABLE
+    entry.tracking = TRACKING_STATUS_RESET
+    entry.consistency.time = 2.5
+    view = forecasts(response)["car-straight"]
+    assert view.tracking is Tracking.RESET
+    assert view.consistency is not None
+    assert view.consistency.time == 2.5
+    assert tracking(response) is Tracking.UNAVAILABLE
+    response.tracking = 99  # type: ignore[assignment]
+    assert tracking(response) is Tracking.UNSPECIFIED
 
 
 def test_no_agents() -> None:

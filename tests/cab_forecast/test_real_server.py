@@ -14,9 +14,12 @@ from cab_forecast import (
     Client,
     NotFound,
     Status,
+    Tracking,
     Unauthenticated,
+    UnknownTrack,
     demo_request,
     forecasts,
+    tracking,
 )
 from service.server import Server
 from service.settings import Settings
@@ -89,6 +92,27 @@ def test_models(arguments: dict[str, Any]) -> None:
         with pytest.raises(NotFound) as caught:
             client.get_model("crystal-ball")
     assert caught.value.reason == "UNKNOWN_MODEL"
+
+
+def test_consistency(arguments: dict[str, Any]) -> None:
+    request = demo_request()
+    request.options.consistency = True
+    with Client(**arguments) as client:
+        client.reset_scene("demo")
+        with pytest.raises(UnknownTrack):
+            client.scene_consistency("demo")
+        with client.watch_scene("demo") as events:
+            assert tracking(client.predict(request)) is not Tracking.UNAVAILABLE
+            event = next(events)
+        response = client.predict(request)
+        view = forecasts(response)["cyclist"]
+        assert (tracking(response), view.tracking) == (Tracking.OK, Tracking.OK)
+        ids = {agent.id for agent in request.agents}
+        assert {instant.agent_id for instant in event.instants} == ids
+        assert {instant.agent_id for instant in client.scene_consistency("demo").latest} == ids
+        assert client.agent_consistency("demo", "cyclist")[-1].time == request.time
+        assert client.model_consistency() == []  # nothing settled yet
+        assert client.reset_scene("demo") == len(ids)
 
 
 def test_a_bad_field_is_named(arguments: dict[str, Any]) -> None:

@@ -8,7 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cab.forecast.v1.model_service_pb2 import AGENT_TYPE_CYCLIST, AgentType
-from cab.forecast.v1.prediction_service_pb2 import CONTEXT_BLIND, CONTEXT_FULL, LayerImage, PredictRequest
+from cab.forecast.v1.prediction_service_pb2 import (
+    CONTEXT_BLIND,
+    CONTEXT_FULL,
+    HISTORY_SOURCE_MEMORY,
+    HISTORY_SOURCE_UNSPECIFIED,
+    LayerImage,
+    PredictRequest,
+)
 from cab_forecast import agent, map_patch, predict_request, scene_raster
 from cab_forecast.layers import Layers, decode_layers, encode_layers
 
@@ -127,6 +134,8 @@ def test_options() -> None:
     assert plain.options.context == CONTEXT_FULL
     assert not plain.options.HasField("seed")
     assert not plain.options.HasField("horizon")
+    assert plain.options.history == HISTORY_SOURCE_UNSPECIFIED  # servers that do not know of it understand
+    assert not plain.options.consistency
     full = predict_request(
         1.0,
         [],
@@ -138,6 +147,8 @@ def test_options() -> None:
         horizon=1.5,
         blind=True,
         strict=True,
+        history="memory",
+        consistency=True,
     )
     assert (full.scene_id, full.model) == ("s", "m@1")
     options = full.options
@@ -145,5 +156,9 @@ def test_options() -> None:
     assert options.HasField("seed")
     assert options.context == CONTEXT_BLIND
     assert options.strict
+    assert options.history == HISTORY_SOURCE_MEMORY
+    assert options.consistency
+    with pytest.raises(ValueError, match="request, memory, not 'both'"):
+        predict_request(1.0, [], history="both")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="range"):
         predict_request(1.0, [], samples=-1)

@@ -5,6 +5,11 @@ import io
 import pytest
 from rich.console import Console
 
+from cab.forecast.v1.consistency_service_pb2 import (
+    TRACKING_STATUS_NEW,
+    TRACKING_STATUS_RESET,
+    TRACKING_STATUS_UNAVAILABLE,
+)
 from cab.forecast.v1.model_service_pb2 import ModelReference
 from cab.forecast.v1.prediction_service_pb2 import FORECAST_STATUS_FALLBACK, PredictRequest, PredictResponse
 from cab_forecast import demo_request
@@ -63,6 +68,21 @@ def test_a_short_horizon() -> None:
     assert "in 1 s" in text
     assert "in 2 s" in text
     assert "in 3 s" not in text
+
+
+def test_what_became_of_the_memory() -> None:
+    response = answer(demo_request())
+    assert "memory" not in shown(response)
+    response.tracking = TRACKING_STATUS_NEW
+    response.timing.tracking = 0.0015
+    assert shown(response).rstrip().splitlines()[-2].endswith("track memory new, 1.5 ms")
+    response.tracking = TRACKING_STATUS_UNAVAILABLE
+    assert "warning: the track memory did not answer in time" in shown(response)
+    response.tracking = TRACKING_STATUS_RESET
+    response.forecasts[1].tracking = TRACKING_STATUS_RESET
+    text = shown(response)
+    assert "warning: what the server remembered of the scene is gone" in text
+    assert "begins anew: truck-behind" in text
 
 
 def test_an_empty_answer() -> None:

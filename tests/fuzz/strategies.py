@@ -6,6 +6,7 @@ from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import Message
 from hypothesis import strategies as st
 
+from cab.forecast.v1 import consistency_service_pb2 as consistency
 from cab.forecast.v1 import model_service_pb2 as models
 from cab.forecast.v1 import prediction_service_pb2 as pb
 
@@ -18,6 +19,7 @@ NASTY_FLOATS = st.one_of(
 NASTY_TEXT = st.one_of(
     st.text(max_size=200), st.sampled_from(["", "\x00", "🚗", "a" * 129, "cab@", "@", "@1.0"])
 )
+NAMES = st.one_of(st.sampled_from(["a", "b", "agent-0"]), NASTY_TEXT)
 NASTY_UNSIGNED = st.sampled_from([0, 1, 3, 26, 2000, 2001, 2**31, 2**32 - 1])
 NASTY_BYTES = st.one_of(
     st.binary(max_size=300), st.binary(max_size=300).map(lambda tail: b"\x89PNG\r\n\x1a\n" + tail)
@@ -162,3 +164,19 @@ def spoil(draw: st.DrawFn, message: Message) -> None:
 def model_requests(model_names: list[str]) -> st.SearchStrategy[models.GetModelRequest]:
     """Requests for one model."""
     return st.one_of(st.sampled_from(model_names), NASTY_TEXT).map(lambda n: models.GetModelRequest(name=n))
+
+
+def consistency_requests() -> st.SearchStrategy[Message]:
+    """Requests about scenes and agents, known and unknown."""
+    return st.one_of(
+        st.builds(
+            consistency.GetAgentConsistencyRequest, scene_id=NAMES, agent_id=NAMES, window=NASTY_FLOATS
+        ),
+        st.builds(consistency.GetSceneConsistencyRequest, scene_id=NAMES),
+        st.builds(consistency.ResetSceneRequest, scene_id=NAMES),
+    )
+
+
+def watch_requests() -> st.SearchStrategy[consistency.WatchSceneRequest]:
+    """Requests to watch a scene."""
+    return st.builds(consistency.WatchSceneRequest, scene_id=NAMES)

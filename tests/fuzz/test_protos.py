@@ -3,20 +3,24 @@
 import math
 from collections import Counter
 from collections.abc import Iterator
+from typing import Any
 
 import grpc
 import httpx
 import numpy as np
 import pytest
+from google.protobuf.message import Message
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
+from cab.forecast.v1 import consistency_service_pb2_grpc as consistency_grpc
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import model_service_pb2_grpc as models_grpc
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from cab.forecast.v1 import prediction_service_pb2_grpc as pb_grpc
 from service.server import Server
-from tests.fuzz.strategies import model_requests, requests
+from tests.fuzz.strategies import consistency_requests, model_requests, requests, watch_requests
 
 pytestmark = [
     pytest.mark.fuzz,
@@ -33,6 +37,7 @@ CASES = settings(
     ],
 )
 FEWER = settings(CASES, max_examples=400)
+FEW = settings(CASES, max_examples=50)
 EXPECTED = {
     grpc.StatusCode.OK,
     grpc.StatusCode.INVALID_ARGUMENT,
@@ -97,6 +102,7 @@ def test_both_transports_answer_alike(
     channel: grpc.Channel, http: httpx.Client, request: pb.PredictRequest
 ) -> None:
     request.options.seed = 1  # without one, every call draws its own
+    request.ClearField("scene_id")  # the second call would be answered by what is remembered of the first
     code = grpc.StatusCode.OK
     by_grpc = pb.PredictResponse()
     try:
@@ -133,6 +139,30 @@ def test_models(channel: grpc.Channel, request: models_pb.GetModelRequest) -> No
         expected_code(error)
         return
     assert response.model.name
+
+
+@FEWER
+@given(request=consistency_requests())
+def test_consistency(channel: grpc.Channel, request: Message) -> None:
+    stub = consistency_grpc.ConsistencyServiceStub(channel)
+    calls: dict[type[Message], Any] = {
+        consistency_pb.GetAgentConsistencyRequest: stub.GetAgentConsistency,
+        consistency_pb.GetSceneConsistencyRequest: stub.GetSceneConsistency,
+        consistency_pb.ResetSceneRequest: stub.ResetScene,
+    }
+    try:
+        calls[type(request)](request, timeout=30)
+    except grpc.RpcError as error:
+        expected_code(error)
+
+
+@FEW
+@given(request=watch_requests())
+def test_watching(channel: grpc.Channel, request: consistency_pb.WatchSceneRequest) -> None:
+    call = consistency_grpc.ConsistencyServiceStub(channel).WatchScene(request, timeout=0.02)
+    with pytest.raises(grpc.RpcError) as caught:
+        list(call)
+    assert caught.value.code() in {grpc.StatusCode.DEADLINE_EXCEEDED, grpc.StatusCode.INVALID_ARGUMENT}
 
 
 def expected_code(error: grpc.RpcError) -> str:

@@ -2,7 +2,7 @@
 
 import asyncio
 import threading
-from collections.abc import AsyncIterator, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,6 +11,7 @@ import grpc
 import httpx
 from google.rpc import error_details_pb2, status_pb2
 
+from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.forecaster import Forecaster
 from service.server import Server
@@ -18,6 +19,7 @@ from service.settings import Settings
 from tests.service.fakes import registry
 
 PREDICT = "/cab.forecast.v1.PredictionService/Predict"
+GET_AGENT = "/cab.forecast.v1.ConsistencyService/GetAgentConsistency"
 
 
 def settings(**values: Any) -> Settings:
@@ -67,8 +69,19 @@ def in_thread(with_settings: Settings) -> Iterator[Server]:
 
 async def until_waiting(server: Server, agents: int) -> None:
     """Returns when so many agents are queued."""
+    await until(lambda: server.metrics.registry.get_sample_value("forecast_queue_agents") == agents)
+
+
+def count(server: Server, transport: str, method: str, code: str) -> float:
+    """How many calls ended so."""
+    labels = {"transport": transport, "method": method, "code": code}
+    return server.metrics.registry.get_sample_value("forecast_requests_total", labels) or 0.0
+
+
+async def until(condition: Callable[[], object]) -> None:
+    """Returns when it holds."""
     async with asyncio.timeout(10):
-        while server.metrics.registry.get_sample_value("forecast_queue_agents") != agents:  # noqa: ASYNC110 - no event tells
+        while not condition():  # noqa: ASYNC110 - no event tells
             await asyncio.sleep(0.005)
 
 
@@ -91,17 +104,36 @@ async def call_grpc(
     timeout: float | None = 20,  # noqa: ASYNC109 - it travels
 ) -> pb.PredictResponse:
     """Predict over gRPC."""
+    body = request if isinstance(request, bytes) else request.SerializeToString()
+    return pb.PredictResponse.FromString(await _invoke(server, PREDICT, body, metadata, timeout))
+
+
+async def get_agent_grpc(
+    server: Server,
+    request: consistency_pb.GetAgentConsistencyRequest,
+    metadata: Mapping[str, str] | None = None,
+) -> consistency_pb.GetAgentConsistencyResponse:
+    """GetAgentConsistency over gRPC."""
+    answer = await _invoke(server, GET_AGENT, request.SerializeToString(), metadata, 20)
+    return consistency_pb.GetAgentConsistencyResponse.FromString(answer)
+
+
+async def _invoke(
+    server: Server,
+    method: str,
+    body: bytes,
+    metadata: Mapping[str, str] | None,
+    timeout: float | None,  # noqa: ASYNC109
+) -> bytes:
     options = [("grpc.max_receive_message_length", -1), ("grpc.use_local_subchannel_pool", 1)]
     async with grpc.aio.insecure_channel(server.grpc_address, options=options) as channel:
         try:
-            answer: bytes = await channel.unary_unary(PREDICT, None, None)(
-                request if isinstance(request, bytes) else request.SerializeToString(),
-                metadata=tuple((metadata or {}).items()),
-                timeout=timeout,
+            answer: bytes = await channel.unary_unary(method, None, None)(
+                body, metadata=tuple((metadata or {}).items()), timeout=timeout
             )
         except grpc.aio.AioRpcError as error:
-            raise _from_grpc(error) from error
-    return pb.PredictResponse.FromString(answer)
+            raise from_grpc(error) from error
+    return answer
 
 
 async def call_rest(
@@ -124,7 +156,25 @@ async def call_rest(
     return pb.PredictResponse.FromString(response.content)
 
 
+async def get_agent_rest(
+    server: Server,
+    request: consistency_pb.GetAgentConsistencyRequest,
+    metadata: Mapping[str, str] | None = None,
+) -> consistency_pb.GetAgentConsistencyResponse:
+    """GetAgentConsistency over REST."""
+    async with httpx.AsyncClient(timeout=20) as client:
+        response = await client.get(
+            f"http://{server.http_address}/v1/consistency/agent",
+            params={field.name: value for field, value in request.ListFields()},
+            headers={"accept": "application/x-protobuf"} | dict(metadata or {}),
+        )
+    if response.status_code != httpx.codes.OK:
+        raise from_problem(response)
+    return consistency_pb.GetAgentConsistencyResponse.FromString(response.content)
+
+
 TRANSPORTS = {"grpc": call_grpc, "rest": call_rest}
+GET_AGENT_BY = {"grpc": get_agent_grpc, "rest": get_agent_rest}
 
 
 def from_problem(response: httpx.Response) -> CallError:
@@ -143,7 +193,8 @@ def from_problem(response: httpx.Response) -> CallError:
     )
 
 
-def _from_grpc(error: grpc.aio.AioRpcError) -> CallError:
+def from_grpc(error: grpc.aio.AioRpcError) -> CallError:
+    """The error in the status and details of a gRPC call."""
     failed = CallError(error.code().name, error.details() or "", "")
     trailing: Any = error.trailing_metadata() or ()
     for key, value in trailing:

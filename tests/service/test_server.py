@@ -1,13 +1,9 @@
 """The server's life: starting, failing to start, draining, as a process of its own."""
 
 import asyncio
-import json
-import os
 import shutil
 import signal
 import socket
-import subprocess
-import sys
 import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager, suppress
@@ -28,6 +24,7 @@ from service.server import Server, StartError
 from service.settings import Settings
 from tests.model.checkpoints import info, network, tensors
 from tests.service.fakes import FakeForecaster, registry
+from tests.service.processes import process, ready
 from tests.service.requests import make_request
 from tests.service.servers import (
     PREDICT,
@@ -375,29 +372,6 @@ async def test_a_folder_of_ones_own_warns_and_one_of_the_paper_protocol_alone_is
         await Server(settings(models=tmp_path)).start()
 
 
-@contextmanager
-def process(*arguments: str) -> Iterator["subprocess.Popen[str]"]:
-    command = [sys.executable, "-m", "service", "serve", "--http", "127.0.0.1:0", "--grpc", "127.0.0.1:0"]
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("FORECAST_")}
-    with subprocess.Popen(  # noqa: S603 - ourselves
-        [*command, *arguments], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
-    ) as started:
-        try:
-            yield started
-        finally:
-            started.kill()
-
-
-def ready(started: "subprocess.Popen[str]") -> tuple[str, str]:
-    """HTTP and gRPC addresses, once it is ready."""
-    assert started.stderr is not None
-    for line in started.stderr:
-        entry = json.loads(line)
-        if entry["event"] == "ready":
-            return entry["http"], entry["grpc"]
-    raise AssertionError("it ended before it was ready")
-
-
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_drains(number: signal.Signals, tmp_path: Path) -> None:
     with process("--log-json", "--models", str(tmp_path)) as started:  # an empty folder: the baselines
@@ -431,7 +405,7 @@ def test_demo_is_printed() -> None:
     ("arguments", "message"),
     [
         (["--default-model", "nobody"], "there is no model 'nobody'"),
-        (["--store", "redis://localhost"], "is not supported"),
+        (["--store", "memcached://localhost"], "store: "),
         (["--models", "/no/such/folder"], "no such folder"),
         (["--config", "/no/such/file.toml"], "no such configuration file"),
     ],

@@ -82,7 +82,7 @@ def test_variables_that_set_nothing_are_refused(monkeypatch: pytest.MonkeyPatch)
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        ({"store": "redis://localhost"}, 'store: "redis://localhost" is not supported'),
+        ({"store": "memcached://localhost"}, "store: is no URL of a Redis"),
         ({"http": "8080"}, 'http: "8080" is not HOST:PORT'),
         ({"grpc": "host:99999"}, "grpc: .* is not HOST:PORT"),
         ({"max_agents": 0}, "max_agents: "),

@@ -49,7 +49,9 @@ class AuthInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]  # 
                 call.code = error.code
                 await abort(context, error)
 
-        # The refusal must be of the same arity as what it stands for; reflection is a stream.
+        # The refusal must be of the same arity as what it stands for: watches and reflection are streams.
         if handler.request_streaming:
             return grpc.stream_stream_rpc_method_handler(refuse)
+        if handler.response_streaming:
+            return grpc.unary_stream_rpc_method_handler(refuse)
         return grpc.unary_unary_rpc_method_handler(refuse)

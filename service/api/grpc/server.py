@@ -5,18 +5,24 @@ from grpc_health.v1 import health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from service.api.auth import Tokens
-from service.api.grpc.handlers import MODEL_SERVICE, PREDICTION_SERVICE, Handlers
+from service.api.grpc.handlers import SERVICES, Handlers
 from service.api.grpc.health import HEALTH_SERVICE, Health
 from service.api.grpc.interceptor import AuthInterceptor
 from service.core.dataplane import DataPlane
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
 
-_SERVICES = (PREDICTION_SERVICE, MODEL_SERVICE)
 _UNLIMITED = -1
 _TRANSPORT_MARGIN = 2
 """Up to this many times the request limit a message is received, to be refused with details; beyond it
 gRPC itself refuses, with the same code but without."""
+_KEEPALIVE = (
+    # A client that vanished without a word is found out in about a minute; its watches would never end
+    ("grpc.keepalive_time_ms", 30_000),
+    ("grpc.keepalive_timeout_ms", 20_000),
+    ("grpc.http2.max_pings_without_data", 0),  # as many as it takes
+    ("grpc.http2.min_ping_interval_without_data_ms", 10_000),  # of clients that do the same
+)
 
 
 class GrpcServer:
@@ -30,13 +36,14 @@ class GrpcServer:
                 ("grpc.max_receive_message_length", settings.max_request_bytes * _TRANSPORT_MARGIN),
                 ("grpc.max_send_message_length", _UNLIMITED),
                 ("grpc.so_reuseport", 0),  # or a second server would share the port in silence
+                *_KEEPALIVE,
             ],
         )
-        self._health = Health(_SERVICES)
+        self._health = Health(SERVICES)
         handlers = Handlers(dataplane, metrics, settings)
         self._server.add_generic_rpc_handlers(tuple(handlers.generic()))
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
-        names = (*_SERVICES, HEALTH_SERVICE, reflection.SERVICE_NAME)
+        names = (*SERVICES, HEALTH_SERVICE, reflection.SERVICE_NAME)
         reflection.enable_server_reflection(names, self._server)
         self.address = ""
         """HOST:PORT that is listened on."""

@@ -11,6 +11,8 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 
 from service.api.boundary import to_service_error
+from service.api.rest.calls import Calls
+from service.api.rest.consistency import ConsistencyEndpoints
 from service.api.rest.endpoints import Endpoints
 from service.api.rest.openapi import openapi_document
 from service.api.rest.problem import problem_response
@@ -41,11 +43,18 @@ def build_app(dataplane: DataPlane, metrics: Metrics, settings: Settings) -> Fas
     app.openapi = lambda: document  # type: ignore[method-assign]  # the way that FastAPI documents
 
     app.add_middleware(HoldUntilSent)
-    endpoints = Endpoints(dataplane, metrics, settings)
+    calls = Calls(metrics, settings)
+    endpoints = Endpoints(dataplane, calls, settings)
+    consistency = ConsistencyEndpoints(dataplane, calls)
     routes: list[tuple[str, str, Callable[[Request], Awaitable[Response]]]] = [
         ("POST", "/v1/predict", endpoints.predict),
         ("GET", "/v1/models", endpoints.list_models),
         ("GET", "/v1/models/{name}", endpoints.get_model),
+        ("GET", "/v1/consistency/agent", consistency.get_agent),
+        ("GET", "/v1/consistency/scene", consistency.get_scene),
+        ("GET", "/v1/consistency/models", consistency.list_models),
+        ("GET", "/v1/consistency/events", consistency.watch_scene),
+        ("POST", "/v1/consistency/reset", consistency.reset_scene),
     ]
     for method, path, endpoint in routes:
         app.add_route(path, endpoint, methods=[method])

@@ -11,6 +11,10 @@ TIMEOUT_HEADER = "Request-Timeout"
 """s that the client waits for the answer."""
 
 
+EVENTS = "text/event-stream"
+"""Server-Sent Events."""
+
+
 class Format(StrEnum):
     """How a message is written."""
 
@@ -49,15 +53,22 @@ def answer_format(headers: Headers, preferred: Format) -> Format:
     Raises:
         NotAcceptable: in no way that is known here.
     """
-    accept = headers.get("accept", "").strip()
-    if not accept:
-        return preferred
-    ranges = [_media_range(part) for part in accept.split(",")]
+    ranges = _media_ranges(headers)
     order = sorted(Format, key=lambda kind: kind is not preferred)
-    best = max(order, key=lambda kind: _quality(kind, ranges))  # the first of equals
-    if _quality(best, ranges) <= 0:
+    best = max(order, key=lambda kind: _quality(kind.value, ranges))  # the first of equals
+    if _quality(best.value, ranges) <= 0:
         raise NotAcceptable(f"answers come as {' or '.join(Format)}")
     return best
+
+
+def check_events_accepted(headers: Headers) -> None:
+    """For answers that come as Server-Sent Events only.
+
+    Raises:
+        NotAcceptable: the client does not want them.
+    """
+    if _quality(EVENTS, _media_ranges(headers)) <= 0:
+        raise NotAcceptable(f"answers come as {EVENTS}")
 
 
 def timeout(headers: Headers) -> float | None:
@@ -78,6 +89,12 @@ def timeout(headers: Headers) -> float | None:
     return seconds
 
 
+def _media_ranges(headers: Headers) -> list[tuple[str, float]]:
+    """Types and their qualities by an Accept header; without one anything will do."""
+    accept = headers.get("accept", "").strip() or "*/*"
+    return [_media_range(part) for part in accept.split(",")]
+
+
 def _media_range(text: str) -> tuple[str, float]:
     """Type and quality of one part of an Accept header; what cannot be read is not wanted."""
     kind, *parameters = (part.strip().lower() for part in text.split(";"))
@@ -92,9 +109,9 @@ def _media_range(text: str) -> tuple[str, float]:
     return kind, quality if math.isfinite(quality) else 0.0
 
 
-def _quality(kind: Format, ranges: list[tuple[str, float]]) -> float:
+def _quality(kind: str, ranges: list[tuple[str, float]]) -> float:
     """By the most specific range that matches, as RFC 9110 has it."""
-    for pattern in (kind.value, "application/*", "*/*"):
+    for pattern in (kind, f"{kind.partition('/')[0]}/*", "*/*"):
         found = [quality for given, quality in ranges if given == pattern]
         if found:
             return max(found)

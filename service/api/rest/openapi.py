@@ -3,37 +3,34 @@
 from importlib import metadata
 from typing import Any
 
-from service.api.rest import problem
-from service.api.rest.comments import comments
-from service.api.rest.examples import predict_examples
-from service.api.rest.negotiation import TIMEOUT_HEADER, Format
-from service.api.rest.schemas import Schema, message_schemas, reference
+from google.protobuf.descriptor import Descriptor
+
+from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
+from service.api.rest.examples import IDS, events_example, predict_examples, reset_examples
+from service.api.rest.operations import (
+    body_of,
+    events_operation,
+    operation,
+    probe,
+    problem_schema,
+    timeout_parameter,
+)
+from service.api.rest.schemas import Schema, message_schemas, query_parameters
 from service.errors import (
     BadFields,
     DeadlineExceeded,
-    Internal,
     MethodNotAllowed,
-    NotAcceptable,
     NotFound,
     Overloaded,
-    ServiceError,
     TooLarge,
-    Unauthenticated,
+    TrackingUnavailable,
     Unavailable,
     UnknownModel,
+    UnknownTrack,
     UnsupportedMediaType,
 )
 from service.settings import Settings
 
-_EVERY_CALL = (Unauthenticated, NotAcceptable, Unavailable, Internal)
-_PREDICT = (
-    BadFields,
-    UnknownModel,
-    TooLarge,
-    UnsupportedMediaType,
-    Overloaded,
-    DeadlineExceeded,
-)
 _DESCRIPTION = """Forecasts where road users will be in the next seconds, as Gaussian mixtures.
 
 The messages are those of the gRPC contract (`cab.forecast.v1`) as JSON by protobuf's JSON mapping, or as
@@ -44,7 +41,7 @@ Errors are `application/problem+json` (RFC 9457); `reason` tells them apart."""
 def openapi_document(settings: Settings) -> dict[str, Any]:
     """The document as a server with these settings serves it."""
     secured = bool(settings.api_tokens)
-    schemas = message_schemas(settings) | {"Problem": _problem_schema()}
+    schemas = message_schemas(settings) | {"Problem": problem_schema()}
     document: dict[str, Any] = {
         "openapi": "3.1.0",
         "info": {
@@ -54,14 +51,13 @@ def openapi_document(settings: Settings) -> dict[str, Any]:
             "license": {"name": "Apache-2.0", "identifier": "Apache-2.0"},
         },
         "paths": {
-            "/v1/predict": {"post": _predict_operation()},
-            "/v1/models": {
-                "get": _operation("ListModels", "ModelService.ListModels", "ListModelsResponse", _EVERY_CALL)
-            },
-            "/v1/models/{name}": {"get": _get_model_operation()},
-            "/livez": {"get": _probe("livez", "Whether the process answers at all.")},
-            "/readyz": {"get": _probe("readyz", "Whether calls are taken.", Unavailable)},
-            "/metrics": {"get": _probe("metrics", "Metrics in the Prometheus text format.")},
+            "/v1/predict": {"post": _predict()},
+            "/v1/models": {"get": operation("ModelService.ListModels", "ListModelsResponse")},
+            "/v1/models/{name}": {"get": _get_model()},
+            **_consistency(settings),
+            "/livez": {"get": probe("livez", "Whether the process answers at all.")},
+            "/readyz": {"get": probe("readyz", "Whether calls are taken.", Unavailable)},
+            "/metrics": {"get": probe("metrics", "Metrics in the Prometheus text format.")},
         },
         "components": {"schemas": schemas},
     }
@@ -69,120 +65,75 @@ def openapi_document(settings: Settings) -> dict[str, Any]:
         document["components"]["securitySchemes"] = {"bearer": {"type": "http", "scheme": "bearer"}}
         for path, operations in document["paths"].items():
             if path.startswith("/v1/"):
-                for operation in operations.values():
-                    operation["security"] = [{"bearer": []}]
+                for each in operations.values():
+                    each["security"] = [{"bearer": []}]
     return document
 
 
-def _predict_operation() -> Schema:
-    operation = _operation(
-        "Predict", "PredictionService.Predict", "PredictResponse", (*_EVERY_CALL, *_PREDICT)
+def _predict() -> Schema:
+    waits = "s that the client waits for the answer; what has not begun by then never does."
+    return operation(
+        "PredictionService.Predict",
+        "PredictResponse",
+        (BadFields, UnknownModel, TooLarge, UnsupportedMediaType, Overloaded, DeadlineExceeded),
+        [timeout_parameter(waits)],
+        body_of("PredictRequest", predict_examples()),
     )
-    operation["parameters"] = [
-        {
-            "name": TIMEOUT_HEADER,
-            "in": "header",
-            "required": False,
-            "description": "s that the client waits for the answer; what has not begun by then never does.",
-            "schema": {"type": "number", "exclusiveMinimum": 0},
-        }
-    ]
-    operation["requestBody"] = {
+
+
+def _get_model() -> Schema:
+    name = {
+        "name": "name",
+        "in": "path",
         "required": True,
-        "content": {
-            Format.JSON.value: {"schema": reference("PredictRequest"), "examples": predict_examples()},
-            Format.PROTOBUF.value: {"schema": {"type": "string", "format": "binary"}},
-        },
+        "description": '"name", which means its newest version, or "name@version".',
+        "schema": {"type": "string", "minLength": 1},
+        "example": "kalman",
     }
-    return operation
+    errors = (UnknownModel, NotFound, MethodNotAllowed)
+    return operation("ModelService.GetModel", "GetModelResponse", errors, [name])
 
 
-def _get_model_operation() -> Schema:
-    operation = _operation(
-        "GetModel",
-        "ModelService.GetModel",
-        "GetModelResponse",
-        (*_EVERY_CALL, UnknownModel, NotFound, MethodNotAllowed),
+def _consistency(settings: Settings) -> dict[str, Schema]:
+    def query(descriptor: Descriptor) -> list[Schema]:
+        return query_parameters(descriptor, settings, IDS | {"window": 2.0})
+
+    asked = (BadFields, UnknownTrack, TrackingUnavailable)
+    agent = operation(
+        "ConsistencyService.GetAgentConsistency",
+        "GetAgentConsistencyResponse",
+        asked,
+        query(consistency_pb.GetAgentConsistencyRequest.DESCRIPTOR),
     )
-    operation["parameters"] = [
-        {
-            "name": "name",
-            "in": "path",
-            "required": True,
-            "description": '"name", which means its newest version, or "name@version".',
-            "schema": {"type": "string", "minLength": 1},
-            "example": "kalman",
-        }
-    ]
-    return operation
-
-
-def _operation(
-    operation_id: str, comment: str, answer: str, errors: tuple[type[ServiceError], ...]
-) -> Schema:
-    text = comments()[comment]
-    answers = {
-        Format.JSON.value: {"schema": reference(answer)},
-        Format.PROTOBUF.value: {"schema": {"type": "string", "format": "binary"}},
-    }
+    scene = operation(
+        "ConsistencyService.GetSceneConsistency",
+        "GetSceneConsistencyResponse",
+        asked,
+        query(consistency_pb.GetSceneConsistencyRequest.DESCRIPTOR),
+    )
+    models = operation(
+        "ConsistencyService.ListModelConsistency", "ListModelConsistencyResponse", (BadFields,)
+    )
+    events = events_operation(
+        "ConsistencyService.WatchScene",
+        "WatchSceneResponse",
+        (BadFields, TrackingUnavailable, Overloaded),
+        [
+            *query(consistency_pb.WatchSceneRequest.DESCRIPTOR),
+            timeout_parameter("s after which the events end; without it they go on."),
+        ],
+        events_example(),
+    )
+    reset = operation(
+        "ConsistencyService.ResetScene",
+        "ResetSceneResponse",
+        (BadFields, TooLarge, UnsupportedMediaType, TrackingUnavailable),
+        body=body_of("ResetSceneRequest", reset_examples()),
+    )
     return {
-        "operationId": operation_id,
-        "summary": text.split(". ")[0].rstrip("."),
-        "description": text,
-        "responses": {"200": {"description": "The answer.", "content": answers}, **_problems(errors)},
-    }
-
-
-def _probe(name: str, description: str, *errors: type[ServiceError]) -> Schema:
-    content = {"text/plain": {"schema": {"type": "string"}}}
-    return {
-        "operationId": name,
-        "summary": description.rstrip("."),
-        "responses": {"200": {"description": "Yes.", "content": content}, **_problems(errors)},
-    }
-
-
-def _problems(errors: tuple[type[ServiceError], ...]) -> dict[str, Schema]:
-    """Responses by HTTP status; rows that share one are listed together."""
-    responses: dict[str, Schema] = {}
-    for error in sorted(errors, key=lambda row: row.http_status):
-        text = f"{error.title} (`{error.reason}`)."
-        response = responses.setdefault(
-            str(error.http_status),
-            {"description": "", "content": {problem.MEDIA_TYPE: {"schema": reference("Problem")}}},
-        )
-        response["description"] = f"{response['description']} {text}".strip()
-        if error in (Overloaded, Unavailable):
-            response["headers"] = {
-                "Retry-After": {
-                    "description": "s until another try makes sense.",
-                    "schema": {"type": "integer"},
-                }
-            }
-    return responses
-
-
-def _problem_schema() -> Schema:
-    text = {"type": "string"}
-    fault = {
-        "type": "object",
-        "properties": {
-            "field": {"type": "string", "description": 'Path in the request, e.g. "agents[3].states[1].x".'},
-            "detail": text,
-        },
-        "required": ["field", "detail"],
-    }
-    return {
-        "type": "object",
-        "description": "An error, by RFC 9457.",
-        "properties": {
-            "type": {"type": "string", "format": "uri"},
-            "title": text,
-            "status": {"type": "integer"},
-            "detail": text,
-            "code": {"type": "string", "description": "Name of the gRPC status code."},
-            "reason": {"type": "string", "description": "Tells errors of one code apart."},
-            "errors": {"type": "array", "items": fault, "description": "The fields that are wrong."},
-        },
-        "required": ["type", "title", "status", "detail", "code", "reason", "errors"],
+        "/v1/consistency/agent": {"get": agent},
+        "/v1/consistency/scene": {"get": scene},
+        "/v1/consistency/models": {"get": models},
+        "/v1/consistency/events": {"get": events},
+        "/v1/consistency/reset": {"post": reset},
     }

@@ -1,13 +1,17 @@
 """JSON schemas of the contract's messages, from their descriptors and comments."""
 
+from collections.abc import Iterable
 from typing import Any
 
 from google.protobuf.descriptor import Descriptor, EnumDescriptor, FieldDescriptor
 
+from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from service.api.rest.comments import comments
-from service.core.options import MAX_ID_LENGTH, MAX_POSITION, MAX_TIME
+from service.core.options import MAX_POSITION, MAX_TIME
+from service.history.store import WINDOW
+from service.limits import MAX_ID_LENGTH
 from service.settings import Settings
 
 Schema = dict[str, Any]
@@ -19,9 +23,20 @@ _SCALARS: dict[int, Schema] = {
     FieldDescriptor.TYPE_STRING: {"type": "string"},
     FieldDescriptor.TYPE_BOOL: {"type": "boolean"},
     FieldDescriptor.TYPE_UINT32: {"type": "integer", "minimum": 0, "maximum": _UINT32_MAX},
+    # As a string, by protobuf's JSON mapping: JSON's numbers are doubles to many who read them
+    FieldDescriptor.TYPE_UINT64: {"type": "string", "format": "uint64", "pattern": "^[0-9]+$"},
 }
-_ROOTS = (pb.PredictRequest, pb.PredictResponse, models_pb.ListModelsResponse, models_pb.GetModelResponse)
-_REQUEST_ROOT = pb.PredictRequest.DESCRIPTOR
+_REQUESTS = (pb.PredictRequest, consistency_pb.ResetSceneRequest)
+_ANSWERS = (
+    pb.PredictResponse,
+    models_pb.ListModelsResponse,
+    models_pb.GetModelResponse,
+    consistency_pb.GetAgentConsistencyResponse,
+    consistency_pb.GetSceneConsistencyResponse,
+    consistency_pb.ListModelConsistencyResponse,
+    consistency_pb.ResetSceneResponse,
+    consistency_pb.WatchSceneResponse,
+)
 
 # What the comments of the contract say in words; a descriptor cannot.
 REQUIRED = {
@@ -30,6 +45,10 @@ REQUIRED = {
     "AgentState": ["time", "x", "y"],
     "MapPatch": ["image"],
     "SceneRaster": ["image", "origin_x", "origin_y", "pixels_per_meter"],
+    "GetAgentConsistencyRequest": ["scene_id", "agent_id"],
+    "GetSceneConsistencyRequest": ["scene_id"],
+    "ResetSceneRequest": ["scene_id"],
+    "WatchSceneRequest": ["scene_id"],
 }
 
 
@@ -39,11 +58,12 @@ def bounds(settings: Settings) -> dict[str, Schema]:
     def within(limit: float) -> Schema:
         return {"minimum": -limit, "maximum": limit}
 
+    an_id = {"minLength": 1, "maxLength": MAX_ID_LENGTH}
     return {
         "PredictRequest.scene_id": {"maxLength": MAX_ID_LENGTH},
         "PredictRequest.time": within(MAX_TIME),
         "PredictRequest.agents": {"maxItems": settings.max_agents},
-        "Agent.id": {"minLength": 1, "maxLength": MAX_ID_LENGTH},
+        "Agent.id": an_id,
         "Agent.states": {"minItems": 1, "maxItems": settings.max_states},
         "AgentState.time": within(MAX_TIME),
         "AgentState.x": within(MAX_POSITION),
@@ -61,21 +81,50 @@ def bounds(settings: Settings) -> dict[str, Schema]:
         "SceneRaster.pixels_per_meter": {"minimum": 0.1, "maximum": 100.0},
         "PredictOptions.samples": {"maximum": settings.max_samples},
         "PredictOptions.horizon": {"minimum": 0.5, "multipleOf": 0.5},
+        "GetAgentConsistencyRequest.scene_id": an_id,
+        "GetAgentConsistencyRequest.agent_id": an_id,
+        "GetAgentConsistencyRequest.window": {"minimum": 0, "maximum": WINDOW},
+        "GetSceneConsistencyRequest.scene_id": an_id,
+        "ResetSceneRequest.scene_id": an_id,
+        "WatchSceneRequest.scene_id": an_id,
     }
 
 
 def message_schemas(settings: Settings) -> dict[str, Schema]:
     """Schemas of all messages and enums that REST carries, by name."""
-    requests = _reachable(_REQUEST_ROOT)
     limits = bounds(settings)
     schemas: dict[str, Schema] = {}
-    for root in _ROOTS:
-        for descriptor in _reachable(root.DESCRIPTOR):
-            schemas[descriptor.name] = _message(descriptor, descriptor in requests, limits)
+    for roots, are_requests in ((_REQUESTS, True), (_ANSWERS, False)):
+        for descriptor in _reachable(root.DESCRIPTOR for root in roots):
+            schemas[descriptor.name] = _message(descriptor, are_requests, limits)
             for field in descriptor.fields:
                 if field.enum_type is not None:
                     schemas[field.enum_type.name] = _enum(field.enum_type)
     return dict(sorted(schemas.items()))
+
+
+def query_parameters(descriptor: Descriptor, settings: Settings, examples: Schema) -> list[Schema]:
+    """A message's fields, which are scalars, as parameters of GET.
+
+    Args:
+        descriptor: of the message.
+        settings: the limits.
+        examples: a value for each field.
+    """
+    limits = bounds(settings)
+    parameters = []
+    for field in descriptor.fields:
+        name = f"{descriptor.name}.{field.name}"
+        parameter: Schema = {
+            "name": field.name,
+            "in": "query",
+            "required": field.name in REQUIRED.get(descriptor.name, []),
+            "schema": _single(field) | limits.get(name, {}),
+            "example": examples[field.name],
+        }
+        _describe(parameter, name)
+        parameters.append(parameter)
+    return parameters
 
 
 def reference(name: str) -> Schema:
@@ -83,10 +132,10 @@ def reference(name: str) -> Schema:
     return {"$ref": f"#/components/schemas/{name}"}
 
 
-def _reachable(descriptor: Descriptor) -> list[Descriptor]:
-    """A message and all within it; maps are no messages of their own here."""
+def _reachable(descriptors: Iterable[Descriptor]) -> list[Descriptor]:
+    """Messages and all within them; maps are no messages of their own here."""
     found: list[Descriptor] = []
-    pending = [descriptor]
+    pending = list(descriptors)
     while pending:
         current = pending.pop()
         if current in found:

@@ -7,18 +7,28 @@ from typing import Any
 
 import pytest
 
+from cab.forecast.v1.consistency_service_pb2 import GetAgentConsistencyRequest
+from service.errors import ServiceError, TrackingUnavailable, UnknownTrack
 from service.settings import FALLBACK_MODEL
 from tests.service.fakes import FakeForecaster
+from tests.service.planes import with_fake_plane
 from tests.service.requests import make_request
-from tests.service.servers import TRANSPORTS, CallError, running, until_waiting
+from tests.service.servers import GET_AGENT_BY, TRANSPORTS, CallError, running, until_waiting
 
 Call = Callable[..., Coroutine[Any, Any, object]]
+ASKED = GetAgentConsistencyRequest(scene_id="s", agent_id="a")
 
 
 @pytest.fixture(params=TRANSPORTS)
 def call(request: pytest.FixtureRequest) -> Call:
     """Predict over one of the transports."""
     return TRANSPORTS[request.param]
+
+
+@pytest.fixture(params=GET_AGENT_BY)
+def get_agent(request: pytest.FixtureRequest) -> Call:
+    """GetAgentConsistency over one of the transports."""
+    return GET_AGENT_BY[request.param]
 
 
 async def failure(awaitable: Awaitable[object]) -> CallError:
@@ -91,6 +101,30 @@ async def test_unknown_model(call: Call, name: str) -> None:
     async with running() as server:
         error = await failure(call(server, make_request(model=name)))
         check(error, "NOT_FOUND", 404, "UNKNOWN_MODEL")
+
+
+@pytest.mark.parametrize(
+    ("error", "row"),
+    [
+        (UnknownTrack("nothing is remembered"), ("NOT_FOUND", 404, "UNKNOWN_TRACK")),
+        (TrackingUnavailable("no answer", 2.0), ("UNAVAILABLE", 503, "TRACKING_UNAVAILABLE")),
+    ],
+)
+async def test_the_track_memorys_errors(
+    get_agent: Call, error: ServiceError, row: tuple[str, int, str]
+) -> None:
+    async with running() as server:
+        with_fake_plane(server).error = error
+        found = await failure(get_agent(server, ASKED))
+        check(found, *row)
+        assert (found.message, found.retry_after) == (error.detail, error.retry_after)
+
+
+async def test_of_nothing_nothing_is_remembered(get_agent: Call) -> None:
+    async with running() as server:
+        check(await failure(get_agent(server, ASKED)), "NOT_FOUND", 404, "UNKNOWN_TRACK")
+        server.dataplane.refuse()
+        check(await failure(get_agent(server, ASKED)), "UNAVAILABLE", 503, "UNAVAILABLE")
 
 
 async def test_too_many_agents(call: Call) -> None:

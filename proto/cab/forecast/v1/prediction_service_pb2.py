@@ -22,40 +22,43 @@ _runtime_version.ValidateProtobufRuntimeVersion(
 _sym_db = _symbol_database.Default()
 
 
+from cab.forecast.v1 import consistency_service_pb2 as cab_dot_forecast_dot_v1_dot_consistency__service__pb2
 from cab.forecast.v1 import model_service_pb2 as cab_dot_forecast_dot_v1_dot_model__service__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n(cab/forecast/v1/prediction_service.proto\x12\x0f\x63\x61\x62.forecast.v1\x1a#cab/forecast/v1/model_service.proto\"\xdb\x01\n\x0ePredictRequest\x12\x10\n\x08scene_id\x18\x01 \x01(\t\x12\x11\n\x04time\x18\x02 \x01(\x01H\x00\x88\x01\x01\x12\r\n\x05model\x18\x03 \x01(\t\x12&\n\x06\x61gents\x18\x04 \x03(\x0b\x32\x16.cab.forecast.v1.Agent\x12\x32\n\x0cscene_raster\x18\x05 \x01(\x0b\x32\x1c.cab.forecast.v1.SceneRaster\x12\x30\n\x07options\x18\x06 \x01(\x0b\x32\x1f.cab.forecast.v1.PredictOptionsB\x07\n\x05_time\"\xba\x01\n\x05\x41gent\x12\n\n\x02id\x18\x01 \x01(\t\x12(\n\x04type\x18\x02 \x01(\x0e\x32\x1a.cab.forecast.v1.AgentType\x12+\n\x06states\x18\x03 \x03(\x0b\x32\x1b.cab.forecast.v1.AgentState\x12\x14\n\x07predict\x18\x04 \x01(\x08H\x00\x88\x01\x01\x12,\n\tmap_patch\x18\x05 \x01(\x0b\x32\x19.cab.forecast.v1.MapPatchB\n\n\x08_predict\"\xd2\x02\n\nAgentState\x12\x11\n\x04time\x18\x01 \x01(\x01H\x00\x88\x01\x01\x12\x0e\n\x01x\x18\x02 \x01(\x01H\x01\x88\x01\x01\x12\x0e\n\x01y\x18\x03 \x01(\x01H\x02\x88\x01\x01\x12\x14\n\x07heading\x18\x04 \x01(\x01H\x03\x88\x01\x01\x12\x17\n\nvelocity_x\x18\x05 \x01(\x01H\x04\x88\x01\x01\x12\x17\n\nvelocity_y\x18\x06 \x01(\x01H\x05\x88\x01\x01\x12\x1b\n\x0e\x61\x63\x63\x65leration_x\x18\x07 \x01(\x01H\x06\x88\x01\x01\x12\x1b\n\x0e\x61\x63\x63\x65leration_y\x18\x08 \x01(\x01H\x07\x88\x01\x01\x12\x19\n\x0cheading_rate\x18\t \x01(\x01H\x08\x88\x01\x01\x42\x07\n\x05_timeB\x04\n\x02_xB\x04\n\x02_yB\n\n\x08_headingB\r\n\x0b_velocity_xB\r\n\x0b_velocity_yB\x11\n\x0f_acceleration_xB\x11\n\x0f_acceleration_yB\x0f\n\r_heading_rate\">\n\nLayerImage\x12\x15\n\x0bpacked_bits\x18\x01 \x01(\x0cH\x00\x12\r\n\x03png\x18\x02 \x01(\x0cH\x00\x42\n\n\x08\x65ncoding\"6\n\x08MapPatch\x12*\n\x05image\x18\x01 \x01(\x0b\x32\x1b.cab.forecast.v1.LayerImage\"\xd4\x01\n\x0bSceneRaster\x12*\n\x05image\x18\x01 \x01(\x0b\x32\x1b.cab.forecast.v1.LayerImage\x12\x0c\n\x04rows\x18\x02 \x01(\r\x12\x0f\n\x07\x63olumns\x18\x03 \x01(\r\x12\x15\n\x08origin_x\x18\x04 \x01(\x01H\x00\x88\x01\x01\x12\x15\n\x08origin_y\x18\x05 \x01(\x01H\x01\x88\x01\x01\x12\x1d\n\x10pixels_per_meter\x18\x06 \x01(\x01H\x02\x88\x01\x01\x42\x0b\n\t_origin_xB\x0b\n\t_origin_yB\x13\n\x11_pixels_per_meter\"\xad\x01\n\x0ePredictOptions\x12\x11\n\tmax_modes\x18\x01 \x01(\r\x12\x0f\n\x07samples\x18\x02 \x01(\r\x12\x11\n\x04seed\x18\x03 \x01(\rH\x00\x88\x01\x01\x12\x14\n\x07horizon\x18\x04 \x01(\x01H\x01\x88\x01\x01\x12)\n\x07\x63ontext\x18\x05 \x01(\x0e\x32\x18.cab.forecast.v1.Context\x12\x0e\n\x06strict\x18\x06 \x01(\x08\x42\x07\n\x05_seedB\n\n\x08_horizon\"\xc5\x02\n\rAgentForecast\x12\x10\n\x08\x61gent_id\x18\x01 \x01(\t\x12/\n\x06status\x18\x02 \x01(\x0e\x32\x1f.cab.forecast.v1.ForecastStatus\x12\x0e\n\x06\x64\x65tail\x18\x03 \x01(\t\x12\r\n\x05\x66ield\x18\x04 \x01(\t\x12.\n\x05model\x18\x05 \x01(\x0b\x32\x1f.cab.forecast.v1.ModelReference\x12\x16\n\x0ehistory_frames\x18\x06 \x01(\r\x12\x10\n\x08mode_ids\x18\x07 \x03(\r\x12\x0f\n\x07weights\x18\x08 \x03(\x01\x12\x18\n\x10remaining_weight\x18\t \x01(\x01\x12\r\n\x05means\x18\n \x03(\x01\x12\x13\n\x0b\x63ovariances\x18\x0b \x03(\x01\x12\x18\n\x10most_likely_mode\x18\x0c \x01(\r\x12\x0f\n\x07samples\x18\r \x03(\x01\"\xe8\x01\n\x0fPredictResponse\x12\x31\n\tforecasts\x18\x01 \x03(\x0b\x32\x1e.cab.forecast.v1.AgentForecast\x12.\n\x05model\x18\x02 \x01(\x0b\x32\x1f.cab.forecast.v1.ModelReference\x12\x0c\n\x04time\x18\x03 \x01(\x01\x12\r\n\x05steps\x18\x04 \x01(\r\x12\x0c\n\x04step\x18\x05 \x01(\x01\x12\'\n\x06timing\x18\x06 \x01(\x0b\x32\x17.cab.forecast.v1.Timing\x12\x0c\n\x04seed\x18\x07 \x01(\r\x12\x10\n\x08warnings\x18\x08 \x03(\t\"@\n\x06Timing\x12\r\n\x05queue\x18\x01 \x01(\x01\x12\x11\n\tinference\x18\x02 \x01(\x01\x12\x14\n\x0c\x62\x61tch_agents\x18\x03 \x01(\r*G\n\x07\x43ontext\x12\x17\n\x13\x43ONTEXT_UNSPECIFIED\x10\x00\x12\x10\n\x0c\x43ONTEXT_FULL\x10\x01\x12\x11\n\rCONTEXT_BLIND\x10\x02*\xa7\x01\n\x0e\x46orecastStatus\x12\x1f\n\x1b\x46ORECAST_STATUS_UNSPECIFIED\x10\x00\x12\x16\n\x12\x46ORECAST_STATUS_OK\x10\x01\x12!\n\x1d\x46ORECAST_STATUS_SHORT_HISTORY\x10\x02\x12\x1c\n\x18\x46ORECAST_STATUS_FALLBACK\x10\x03\x12\x1b\n\x17\x46ORECAST_STATUS_INVALID\x10\x04\x32\x61\n\x11PredictionService\x12L\n\x07Predict\x12\x1f.cab.forecast.v1.PredictRequest\x1a .cab.forecast.v1.PredictResponseb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n(cab/forecast/v1/prediction_service.proto\x12\x0f\x63\x61\x62.forecast.v1\x1a)cab/forecast/v1/consistency_service.proto\x1a#cab/forecast/v1/model_service.proto\"\xdb\x01\n\x0ePredictRequest\x12\x10\n\x08scene_id\x18\x01 \x01(\t\x12\x11\n\x04time\x18\x02 \x01(\x01H\x00\x88\x01\x01\x12\r\n\x05model\x18\x03 \x01(\t\x12&\n\x06\x61gents\x18\x04 \x03(\x0b\x32\x16.cab.forecast.v1.Agent\x12\x32\n\x0cscene_raster\x18\x05 \x01(\x0b\x32\x1c.cab.forecast.v1.SceneRaster\x12\x30\n\x07options\x18\x06 \x01(\x0b\x32\x1f.cab.forecast.v1.PredictOptionsB\x07\n\x05_time\"\xba\x01\n\x05\x41gent\x12\n\n\x02id\x18\x01 \x01(\t\x12(\n\x04type\x18\x02 \x01(\x0e\x32\x1a.cab.forecast.v1.AgentType\x12+\n\x06states\x18\x03 \x03(\x0b\x32\x1b.cab.forecast.v1.AgentState\x12\x14\n\x07predict\x18\x04 \x01(\x08H\x00\x88\x01\x01\x12,\n\tmap_patch\x18\x05 \x01(\x0b\x32\x19.cab.forecast.v1.MapPatchB\n\n\x08_predict\"\xd2\x02\n\nAgentState\x12\x11\n\x04time\x18\x01 \x01(\x01H\x00\x88\x01\x01\x12\x0e\n\x01x\x18\x02 \x01(\x01H\x01\x88\x01\x01\x12\x0e\n\x01y\x18\x03 \x01(\x01H\x02\x88\x01\x01\x12\x14\n\x07heading\x18\x04 \x01(\x01H\x03\x88\x01\x01\x12\x17\n\nvelocity_x\x18\x05 \x01(\x01H\x04\x88\x01\x01\x12\x17\n\nvelocity_y\x18\x06 \x01(\x01H\x05\x88\x01\x01\x12\x1b\n\x0e\x61\x63\x63\x65leration_x\x18\x07 \x01(\x01H\x06\x88\x01\x01\x12\x1b\n\x0e\x61\x63\x63\x65leration_y\x18\x08 \x01(\x01H\x07\x88\x01\x01\x12\x19\n\x0cheading_rate\x18\t \x01(\x01H\x08\x88\x01\x01\x42\x07\n\x05_timeB\x04\n\x02_xB\x04\n\x02_yB\n\n\x08_headingB\r\n\x0b_velocity_xB\r\n\x0b_velocity_yB\x11\n\x0f_acceleration_xB\x11\n\x0f_acceleration_yB\x0f\n\r_heading_rate\">\n\nLayerImage\x12\x15\n\x0bpacked_bits\x18\x01 \x01(\x0cH\x00\x12\r\n\x03png\x18\x02 \x01(\x0cH\x00\x42\n\n\x08\x65ncoding\"6\n\x08MapPatch\x12*\n\x05image\x18\x01 \x01(\x0b\x32\x1b.cab.forecast.v1.LayerImage\"\xd4\x01\n\x0bSceneRaster\x12*\n\x05image\x18\x01 \x01(\x0b\x32\x1b.cab.forecast.v1.LayerImage\x12\x0c\n\x04rows\x18\x02 \x01(\r\x12\x0f\n\x07\x63olumns\x18\x03 \x01(\r\x12\x15\n\x08origin_x\x18\x04 \x01(\x01H\x00\x88\x01\x01\x12\x15\n\x08origin_y\x18\x05 \x01(\x01H\x01\x88\x01\x01\x12\x1d\n\x10pixels_per_meter\x18\x06 \x01(\x01H\x02\x88\x01\x01\x42\x0b\n\t_origin_xB\x0b\n\t_origin_yB\x13\n\x11_pixels_per_meter\"\xf3\x01\n\x0ePredictOptions\x12\x11\n\tmax_modes\x18\x01 \x01(\r\x12\x0f\n\x07samples\x18\x02 \x01(\r\x12\x11\n\x04seed\x18\x03 \x01(\rH\x00\x88\x01\x01\x12\x14\n\x07horizon\x18\x04 \x01(\x01H\x01\x88\x01\x01\x12)\n\x07\x63ontext\x18\x05 \x01(\x0e\x32\x18.cab.forecast.v1.Context\x12\x0e\n\x06strict\x18\x06 \x01(\x08\x12/\n\x07history\x18\x07 \x01(\x0e\x32\x1e.cab.forecast.v1.HistorySource\x12\x13\n\x0b\x63onsistency\x18\x08 \x01(\x08\x42\x07\n\x05_seedB\n\n\x08_horizon\"\xb2\x03\n\rAgentForecast\x12\x10\n\x08\x61gent_id\x18\x01 \x01(\t\x12/\n\x06status\x18\x02 \x01(\x0e\x32\x1f.cab.forecast.v1.ForecastStatus\x12\x0e\n\x06\x64\x65tail\x18\x03 \x01(\t\x12\r\n\x05\x66ield\x18\x04 \x01(\t\x12.\n\x05model\x18\x05 \x01(\x0b\x32\x1f.cab.forecast.v1.ModelReference\x12\x16\n\x0ehistory_frames\x18\x06 \x01(\r\x12\x10\n\x08mode_ids\x18\x07 \x03(\r\x12\x0f\n\x07weights\x18\x08 \x03(\x01\x12\x18\n\x10remaining_weight\x18\t \x01(\x01\x12\r\n\x05means\x18\n \x03(\x01\x12\x13\n\x0b\x63ovariances\x18\x0b \x03(\x01\x12\x18\n\x10most_likely_mode\x18\x0c \x01(\r\x12\x0f\n\x07samples\x18\r \x03(\x01\x12\x31\n\x08tracking\x18\x0e \x01(\x0e\x32\x1f.cab.forecast.v1.TrackingStatus\x12\x38\n\x0b\x63onsistency\x18\x0f \x01(\x0b\x32#.cab.forecast.v1.InstantConsistency\"\x9b\x02\n\x0fPredictResponse\x12\x31\n\tforecasts\x18\x01 \x03(\x0b\x32\x1e.cab.forecast.v1.AgentForecast\x12.\n\x05model\x18\x02 \x01(\x0b\x32\x1f.cab.forecast.v1.ModelReference\x12\x0c\n\x04time\x18\x03 \x01(\x01\x12\r\n\x05steps\x18\x04 \x01(\r\x12\x0c\n\x04step\x18\x05 \x01(\x01\x12\'\n\x06timing\x18\x06 \x01(\x0b\x32\x17.cab.forecast.v1.Timing\x12\x0c\n\x04seed\x18\x07 \x01(\r\x12\x10\n\x08warnings\x18\x08 \x03(\t\x12\x31\n\x08tracking\x18\t \x01(\x0e\x32\x1f.cab.forecast.v1.TrackingStatus\"R\n\x06Timing\x12\r\n\x05queue\x18\x01 \x01(\x01\x12\x11\n\tinference\x18\x02 \x01(\x01\x12\x14\n\x0c\x62\x61tch_agents\x18\x03 \x01(\r\x12\x10\n\x08tracking\x18\x04 \x01(\x01*G\n\x07\x43ontext\x12\x17\n\x13\x43ONTEXT_UNSPECIFIED\x10\x00\x12\x10\n\x0c\x43ONTEXT_FULL\x10\x01\x12\x11\n\rCONTEXT_BLIND\x10\x02*f\n\rHistorySource\x12\x1e\n\x1aHISTORY_SOURCE_UNSPECIFIED\x10\x00\x12\x1a\n\x16HISTORY_SOURCE_REQUEST\x10\x01\x12\x19\n\x15HISTORY_SOURCE_MEMORY\x10\x02*\xa7\x01\n\x0e\x46orecastStatus\x12\x1f\n\x1b\x46ORECAST_STATUS_UNSPECIFIED\x10\x00\x12\x16\n\x12\x46ORECAST_STATUS_OK\x10\x01\x12!\n\x1d\x46ORECAST_STATUS_SHORT_HISTORY\x10\x02\x12\x1c\n\x18\x46ORECAST_STATUS_FALLBACK\x10\x03\x12\x1b\n\x17\x46ORECAST_STATUS_INVALID\x10\x04\x32\x61\n\x11PredictionService\x12L\n\x07Predict\x12\x1f.cab.forecast.v1.PredictRequest\x1a .cab.forecast.v1.PredictResponseb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'cab.forecast.v1.prediction_service_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_CONTEXT']._serialized_start=1990
-  _globals['_CONTEXT']._serialized_end=2061
-  _globals['_FORECASTSTATUS']._serialized_start=2064
-  _globals['_FORECASTSTATUS']._serialized_end=2231
-  _globals['_PREDICTREQUEST']._serialized_start=99
-  _globals['_PREDICTREQUEST']._serialized_end=318
-  _globals['_AGENT']._serialized_start=321
-  _globals['_AGENT']._serialized_end=507
-  _globals['_AGENTSTATE']._serialized_start=510
-  _globals['_AGENTSTATE']._serialized_end=848
-  _globals['_LAYERIMAGE']._serialized_start=850
-  _globals['_LAYERIMAGE']._serialized_end=912
-  _globals['_MAPPATCH']._serialized_start=914
-  _globals['_MAPPATCH']._serialized_end=968
-  _globals['_SCENERASTER']._serialized_start=971
-  _globals['_SCENERASTER']._serialized_end=1183
-  _globals['_PREDICTOPTIONS']._serialized_start=1186
-  _globals['_PREDICTOPTIONS']._serialized_end=1359
-  _globals['_AGENTFORECAST']._serialized_start=1362
-  _globals['_AGENTFORECAST']._serialized_end=1687
-  _globals['_PREDICTRESPONSE']._serialized_start=1690
-  _globals['_PREDICTRESPONSE']._serialized_end=1922
-  _globals['_TIMING']._serialized_start=1924
-  _globals['_TIMING']._serialized_end=1988
-  _globals['_PREDICTIONSERVICE']._serialized_start=2233
-  _globals['_PREDICTIONSERVICE']._serialized_end=2330
+  _globals['_CONTEXT']._serialized_start=2281
+  _globals['_CONTEXT']._serialized_end=2352
+  _globals['_HISTORYSOURCE']._serialized_start=2354
+  _globals['_HISTORYSOURCE']._serialized_end=2456
+  _globals['_FORECASTSTATUS']._serialized_start=2459
+  _globals['_FORECASTSTATUS']._serialized_end=2626
+  _globals['_PREDICTREQUEST']._serialized_start=142
+  _globals['_PREDICTREQUEST']._serialized_end=361
+  _globals['_AGENT']._serialized_start=364
+  _globals['_AGENT']._serialized_end=550
+  _globals['_AGENTSTATE']._serialized_start=553
+  _globals['_AGENTSTATE']._serialized_end=891
+  _globals['_LAYERIMAGE']._serialized_start=893
+  _globals['_LAYERIMAGE']._serialized_end=955
+  _globals['_MAPPATCH']._serialized_start=957
+  _globals['_MAPPATCH']._serialized_end=1011
+  _globals['_SCENERASTER']._serialized_start=1014
+  _globals['_SCENERASTER']._serialized_end=1226
+  _globals['_PREDICTOPTIONS']._serialized_start=1229
+  _globals['_PREDICTOPTIONS']._serialized_end=1472
+  _globals['_AGENTFORECAST']._serialized_start=1475
+  _globals['_AGENTFORECAST']._serialized_end=1909
+  _globals['_PREDICTRESPONSE']._serialized_start=1912
+  _globals['_PREDICTRESPONSE']._serialized_end=2195
+  _globals['_TIMING']._serialized_start=2197
+  _globals['_TIMING']._serialized_end=2279
+  _globals['_PREDICTIONSERVICE']._serialized_start=2628
+  _globals['_PREDICTIONSERVICE']._serialized_end=2725
 # @@protoc_insertion_point(module_scope)

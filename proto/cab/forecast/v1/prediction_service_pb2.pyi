@@ -3,6 +3,7 @@
 isort:skip_file
 """
 
+from cab.forecast.v1 import consistency_service_pb2 as _consistency_service_pb2
 from cab.forecast.v1 import model_service_pb2 as _model_service_pb2
 from collections import abc as _abc
 from google.protobuf import descriptor as _descriptor
@@ -42,6 +43,36 @@ CONTEXT_BLIND: Context.ValueType  # 2
 """From the agent's own history alone (CAB's blind forecast)."""
 Global___Context: _TypeAlias = Context  # noqa: Y015
 
+class _HistorySource:
+    ValueType = _typing.NewType("ValueType", _builtins.int)
+    V: _TypeAlias = ValueType  # noqa: Y015
+
+class _HistorySourceEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_HistorySource.ValueType], _builtins.type):
+    DESCRIPTOR: _descriptor.EnumDescriptor
+    HISTORY_SOURCE_UNSPECIFIED: _HistorySource.ValueType  # 0
+    HISTORY_SOURCE_REQUEST: _HistorySource.ValueType  # 1
+    """The default: from the request, which gives all that is to be used. Its newest state of each agent is
+    remembered.
+    """
+    HISTORY_SOURCE_MEMORY: _HistorySource.ValueType  # 2
+    """From the track memory as well: a request needs to give only what is new of each agent, and may give more.
+    All that it gives is remembered; of one time what came first is kept. Needs a scene_id.
+    """
+
+class HistorySource(_HistorySource, metaclass=_HistorySourceEnumTypeWrapper):
+    """Where the agents' earlier observations come from."""
+
+HISTORY_SOURCE_UNSPECIFIED: HistorySource.ValueType  # 0
+HISTORY_SOURCE_REQUEST: HistorySource.ValueType  # 1
+"""The default: from the request, which gives all that is to be used. Its newest state of each agent is
+remembered.
+"""
+HISTORY_SOURCE_MEMORY: HistorySource.ValueType  # 2
+"""From the track memory as well: a request needs to give only what is new of each agent, and may give more.
+All that it gives is remembered; of one time what came first is kept. Needs a scene_id.
+"""
+Global___HistorySource: _TypeAlias = HistorySource  # noqa: Y015
+
 class _ForecastStatus:
     ValueType = _typing.NewType("ValueType", _builtins.int)
     V: _TypeAlias = ValueType  # noqa: Y015
@@ -80,8 +111,8 @@ class PredictRequest(_message.Message):
     SCENE_RASTER_FIELD_NUMBER: _builtins.int
     OPTIONS_FIELD_NUMBER: _builtins.int
     scene_id: _builtins.str
-    """Names the scene, at most 128 characters. Optional; a server that remembers agents keys its memory
-    by it.
+    """Names the scene, at most 128 characters. Optional: with it the server remembers the agents (see
+    ConsistencyService), each by its id. The ground frame must stay the same as long as the name does.
     """
     time: _builtins.float
     """The present: forecasts start here. Required, within [-1e10, 1e10] s."""
@@ -378,6 +409,8 @@ class PredictOptions(_message.Message):
     HORIZON_FIELD_NUMBER: _builtins.int
     CONTEXT_FIELD_NUMBER: _builtins.int
     STRICT_FIELD_NUMBER: _builtins.int
+    HISTORY_FIELD_NUMBER: _builtins.int
+    CONSISTENCY_FIELD_NUMBER: _builtins.int
     max_modes: _builtins.int
     """Return the most likely modes only, at most this many; remaining_weight is what the rest weigh.
     0 returns all.
@@ -393,6 +426,9 @@ class PredictOptions(_message.Message):
     """True: an agent that cannot be forecast as asked (INVALID or FALLBACK) fails the call with
     INVALID_ARGUMENT.
     """
+    history: Global___HistorySource.ValueType
+    consistency: _builtins.bool
+    """True: give each forecast the latest consistency of its agent. Needs a scene_id."""
     def __init__(
         self,
         *,
@@ -402,10 +438,12 @@ class PredictOptions(_message.Message):
         horizon: _builtins.float | None = ...,
         context: Global___Context.ValueType = ...,
         strict: _builtins.bool = ...,
+        history: Global___HistorySource.ValueType = ...,
+        consistency: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["_horizon", b"_horizon", "_seed", b"_seed", "horizon", b"horizon", "seed", b"seed"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_horizon", b"_horizon", "_seed", b"_seed", "context", b"context", "horizon", b"horizon", "max_modes", b"max_modes", "samples", b"samples", "seed", b"seed", "strict", b"strict"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_horizon", b"_horizon", "_seed", b"_seed", "consistency", b"consistency", "context", b"context", "history", b"history", "horizon", b"horizon", "max_modes", b"max_modes", "samples", b"samples", "seed", b"seed", "strict", b"strict"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__horizon: _TypeAlias = _typing.Literal["horizon"]  # noqa: Y015
     _WhichOneofArgType__horizon: _TypeAlias = _typing.Literal["_horizon", b"_horizon"]  # noqa: Y015
@@ -439,6 +477,8 @@ class AgentForecast(_message.Message):
     COVARIANCES_FIELD_NUMBER: _builtins.int
     MOST_LIKELY_MODE_FIELD_NUMBER: _builtins.int
     SAMPLES_FIELD_NUMBER: _builtins.int
+    TRACKING_FIELD_NUMBER: _builtins.int
+    CONSISTENCY_FIELD_NUMBER: _builtins.int
     agent_id: _builtins.str
     status: Global___ForecastStatus.ValueType
     detail: _builtins.str
@@ -451,6 +491,8 @@ class AgentForecast(_message.Message):
     """Probability of the modes that max_modes left out."""
     most_likely_mode: _builtins.int
     """Index into weights of the mode with the greatest probability."""
+    tracking: _consistency_service_pb2.TrackingStatus.ValueType
+    """What became of the memory of this agent."""
     @_builtins.property
     def model(self) -> _model_service_pb2.ModelReference:
         """The model that made this forecast."""
@@ -478,6 +520,12 @@ class AgentForecast(_message.Message):
         is distributed as the mixture and the path is smooth.
         """
 
+    @_builtins.property
+    def consistency(self) -> _consistency_service_pb2.InstantConsistency:
+        """With options.consistency: the agent's newest observation, and what the model of this forecast said about
+        it before. Absent where nothing is remembered.
+        """
+
     def __init__(
         self,
         *,
@@ -494,10 +542,12 @@ class AgentForecast(_message.Message):
         covariances: _abc.Iterable[_builtins.float] | None = ...,
         most_likely_mode: _builtins.int = ...,
         samples: _abc.Iterable[_builtins.float] | None = ...,
+        tracking: _consistency_service_pb2.TrackingStatus.ValueType = ...,
+        consistency: _consistency_service_pb2.InstantConsistency | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["model", b"model"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["consistency", b"consistency", "model", b"model"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "covariances", b"covariances", "detail", b"detail", "field", b"field", "history_frames", b"history_frames", "means", b"means", "mode_ids", b"mode_ids", "model", b"model", "most_likely_mode", b"most_likely_mode", "remaining_weight", b"remaining_weight", "samples", b"samples", "status", b"status", "weights", b"weights"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "consistency", b"consistency", "covariances", b"covariances", "detail", b"detail", "field", b"field", "history_frames", b"history_frames", "means", b"means", "mode_ids", b"mode_ids", "model", b"model", "most_likely_mode", b"most_likely_mode", "remaining_weight", b"remaining_weight", "samples", b"samples", "status", b"status", "tracking", b"tracking", "weights", b"weights"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -515,6 +565,7 @@ class PredictResponse(_message.Message):
     TIMING_FIELD_NUMBER: _builtins.int
     SEED_FIELD_NUMBER: _builtins.int
     WARNINGS_FIELD_NUMBER: _builtins.int
+    TRACKING_FIELD_NUMBER: _builtins.int
     time: _builtins.float
     """s, the request's."""
     steps: _builtins.int
@@ -522,6 +573,8 @@ class PredictResponse(_message.Message):
     step: _builtins.float
     seed: _builtins.int
     """Seed of the samples; 0 when none were asked for."""
+    tracking: _consistency_service_pb2.TrackingStatus.ValueType
+    """What became of the memory of the scene."""
     @_builtins.property
     def forecasts(self) -> _containers.RepeatedCompositeFieldContainer[Global___AgentForecast]:
         """One for each agent with predict = true, in the request's order; invalid context agents stand among
@@ -551,10 +604,11 @@ class PredictResponse(_message.Message):
         timing: Global___Timing | None = ...,
         seed: _builtins.int = ...,
         warnings: _abc.Iterable[_builtins.str] | None = ...,
+        tracking: _consistency_service_pb2.TrackingStatus.ValueType = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["model", b"model", "timing", b"timing"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["forecasts", b"forecasts", "model", b"model", "seed", b"seed", "step", b"step", "steps", b"steps", "time", b"time", "timing", b"timing", "warnings", b"warnings"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["forecasts", b"forecasts", "model", b"model", "seed", b"seed", "step", b"step", "steps", b"steps", "time", b"time", "timing", b"timing", "tracking", b"tracking", "warnings", b"warnings"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
@@ -567,22 +621,26 @@ class Timing(_message.Message):
     QUEUE_FIELD_NUMBER: _builtins.int
     INFERENCE_FIELD_NUMBER: _builtins.int
     BATCH_AGENTS_FIELD_NUMBER: _builtins.int
+    TRACKING_FIELD_NUMBER: _builtins.int
     queue: _builtins.float
     """s from acceptance to the start of the (first) batch: decoding, and waiting for the model to be free."""
     inference: _builtins.float
     """s inside the model, of all batches that this call rode in."""
     batch_agents: _builtins.int
     """Agents in the (largest) batch that it rode in, other calls' included."""
+    tracking: _builtins.float
+    """s that the call waited for the track memory; most of it passes while the answer is put together."""
     def __init__(
         self,
         *,
         queue: _builtins.float = ...,
         inference: _builtins.float = ...,
         batch_agents: _builtins.int = ...,
+        tracking: _builtins.float = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["batch_agents", b"batch_agents", "inference", b"inference", "queue", b"queue"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["batch_agents", b"batch_agents", "inference", b"inference", "queue", b"queue", "tracking", b"tracking"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

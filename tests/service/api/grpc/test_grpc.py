@@ -16,7 +16,12 @@ from tests.service.fakes import FakeForecaster
 from tests.service.requests import make_request
 from tests.service.servers import CallError, call_grpc, running
 
-SERVICES = ["", "cab.forecast.v1.PredictionService", "cab.forecast.v1.ModelService"]
+SERVICES = [
+    "",
+    "cab.forecast.v1.PredictionService",
+    "cab.forecast.v1.ModelService",
+    "cab.forecast.v1.ConsistencyService",
+]
 
 
 @pytest.fixture

@@ -3,7 +3,13 @@
 import pytest
 from starlette.datastructures import Headers
 
-from service.api.rest.negotiation import Format, answer_format, request_format, timeout
+from service.api.rest.negotiation import (
+    Format,
+    answer_format,
+    check_events_accepted,
+    request_format,
+    timeout,
+)
 from service.errors import BadField, NotAcceptable, UnsupportedMediaType
 
 JSON, PROTOBUF = Format.JSON, Format.PROTOBUF
@@ -60,6 +66,17 @@ def test_accept(accept: str | None, expected: Format) -> None:
 def test_accept_refused(accept: str) -> None:
     with pytest.raises(NotAcceptable):
         answer_format(Headers({"accept": accept}), preferred=JSON)
+
+
+@pytest.mark.parametrize("accept", [None, "*/*", "text/*", "text/event-stream", "text/html, */*;q=0.1"])
+def test_events_accepted(accept: str | None) -> None:
+    check_events_accepted(Headers({"accept": accept} if accept else {}))
+
+
+@pytest.mark.parametrize("accept", ["application/json", "application/*", "text/event-stream;q=0, */*"])
+def test_events_not_accepted(accept: str) -> None:
+    with pytest.raises(NotAcceptable, match="text/event-stream"):
+        check_events_accepted(Headers({"accept": accept}))
 
 
 def test_timeout() -> None:

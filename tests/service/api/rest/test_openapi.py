@@ -4,25 +4,30 @@ from typing import Any
 
 import httpx
 import pytest
+from google.protobuf import json_format
 from pydantic import SecretStr
 
+from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
+from service.api.rest.codec import to_dict
 from service.api.rest.comments import comments, parse_comments
-from service.api.rest.examples import predict_examples
+from service.api.rest.examples import IDS, predict_examples, reset_examples
 from service.api.rest.openapi import openapi_document
 from service.api.rest.schemas import REQUIRED, bounds
+from service.history.store import WINDOW
 from service.settings import Settings
 from tests.service.fakes import FakeForecaster
 from tests.service.servers import running
 
+FILES = (pb.DESCRIPTOR, models_pb.DESCRIPTOR, consistency_pb.DESCRIPTOR)
 DOCUMENT = openapi_document(Settings())
 SCHEMAS: dict[str, Any] = DOCUMENT["components"]["schemas"]
 
 
 def test_every_message_field_and_value_has_its_comment_or_a_neighbor_has() -> None:
     texts = comments()
-    for file in (pb.DESCRIPTOR, models_pb.DESCRIPTOR):
+    for file in FILES:
         for name, service in file.services_by_name.items():
             assert name in texts
             assert all(f"{name}.{method.name}" in texts for method in service.methods)
@@ -30,9 +35,9 @@ def test_every_message_field_and_value_has_its_comment_or_a_neighbor_has() -> No
     assert texts["LayerImage.png"].startswith("An 8-bit RGB image")
     assert texts["ForecastStatus.FORECAST_STATUS_SHORT_HISTORY"].startswith("A forecast from fewer")
     assert texts["Model.benchmark"].startswith("Benchmark figures")
-    known = {m for file in (pb.DESCRIPTOR, models_pb.DESCRIPTOR) for m in file.message_types_by_name}
-    known |= {e for file in (pb.DESCRIPTOR, models_pb.DESCRIPTOR) for e in file.enum_types_by_name}
-    known |= {s for file in (pb.DESCRIPTOR, models_pb.DESCRIPTOR) for s in file.services_by_name}
+    known = {m for file in FILES for m in file.message_types_by_name}
+    known |= {e for file in FILES for e in file.enum_types_by_name}
+    known |= {s for file in FILES for s in file.services_by_name}
     assert {name.partition(".")[0] for name in texts} <= known
 
 
@@ -75,12 +80,42 @@ def test_schemas_have_the_messages_fields() -> None:
 
 
 def test_hand_written_parts_name_real_fields() -> None:
-    messages = pb.DESCRIPTOR.message_types_by_name
+    messages = {name: kind for file in FILES for name, kind in file.message_types_by_name.items()}
     for name, fields in REQUIRED.items():
         assert set(fields) <= {field.name for field in messages[name].fields}
     for path in bounds(Settings()):
         name, _, field = path.partition(".")
         assert field in messages[name].fields_by_name
+
+
+def test_every_method_of_the_contract_has_an_operation() -> None:
+    operations = {each["operationId"] for path in DOCUMENT["paths"].values() for each in path.values()}
+    methods = {m.name for file in FILES for s in file.services_by_name.values() for m in s.methods}
+    assert methods <= operations
+
+
+def test_parameters_are_the_requests_fields() -> None:
+    scene, agent, window = DOCUMENT["paths"]["/v1/consistency/agent"]["get"]["parameters"]
+    assert (scene["name"], scene["required"], scene["schema"]["maxLength"]) == ("scene_id", True, 128)
+    assert agent["example"] == "car-1"
+    assert (window["required"], window["schema"]["maximum"]) == (False, WINDOW)
+    assert window["description"].startswith("s back from the agent's newest observation")
+    assert "parameters" not in DOCUMENT["paths"]["/v1/consistency/models"]["get"]
+
+
+def test_counts_are_strings_as_protobuf_writes_them() -> None:
+    assert SCHEMAS["Summary"]["properties"]["count"]["type"] == "string"
+    assert to_dict(consistency_pb.Summary(count=7))["count"] == "7"
+
+
+def test_events_are_documented() -> None:
+    watch = DOCUMENT["paths"]["/v1/consistency/events"]["get"]
+    assert sorted(watch["responses"]) == ["200", "401", "406", "422", "429", "500", "503"]
+    (content,) = watch["responses"]["200"]["content"].items()
+    assert content[0] == "text/event-stream"
+    event = content[1]["example"]
+    assert json_format.Parse(event["data"], consistency_pb.WatchSceneResponse()).instants
+    assert "WatchSceneResponse" in SCHEMAS
 
 
 def test_references_lead_somewhere() -> None:
@@ -126,3 +161,8 @@ async def test_examples_work(default: str) -> None:
             forecasts = response.json()["forecasts"]
             assert forecasts
             assert all(forecast["status"] == "FORECAST_STATUS_OK" for forecast in forecasts)
+        found = await client.get(f"{base}/v1/consistency/agent", params=IDS)  # one of them names a scene
+        assert found.status_code == 200, found.text
+        for example in reset_examples().values():
+            response = await client.post(f"{base}/v1/consistency/reset", json=example["value"])
+            assert response.json()["agents"] > 0

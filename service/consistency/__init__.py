@@ -1,0 +1,1 @@
+"""What the track memory tells: dispersion, convergence-to-range, displacement error, live."""

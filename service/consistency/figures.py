@@ -1,0 +1,94 @@
+"""What a set of forecasts for one instant tells (Ben-Younes et al. 2022, section 4), by ``model.metrics``."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.arrays import Bools, Floats
+from model.metrics.convergence import RANGES_M, convergence_s, errors_by_age_m
+from model.metrics.dispersion import Dispersion, dispersion
+from model.metrics.displacement import displacement_m
+from model.resample import TIME_TOLERANCE
+from model.scene import STEP_SECONDS
+from service.history.records import AGES, COMPLETE, NEWLY, SETTLED, unpack_instants
+
+AGES_S = STEP_SECONDS * np.arange(1, AGES + 1)
+"""[A], s."""
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Of P instants, A ages."""
+
+    time: Floats
+    """[P], s, of the observation."""
+    complete: Bools
+    """[P]."""
+    settled: Bools
+    """[P]."""
+    newly: Bools
+    """[P], whether it counts now."""
+    dispersion: Dispersion
+    """[P] each, m; NaN where the set is not complete."""
+    convergence_s: Floats
+    """[P, R] for each of ``RANGES_M``, s; NaN where the set is not complete."""
+    errors_m: Floats
+    """[P, A]; NaN where there is no forecast."""
+    nearest: Bools
+    """[P, A], whether none of the five likeliest modes was nearer to the observation than the likeliest."""
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+def figures(packed: bytes) -> Figures:
+    """Figures of instants.
+
+    Args:
+        packed: P of ``records.INSTANT``.
+    """
+    instants = unpack_instants(packed)
+    points, others = _at_the_instant(
+        instants["time"], instants["made_at"], instants["blocks"]["point"], instants["blocks"]["others"]
+    )
+    truth = instants["position"]
+    errors_m = errors_by_age_m(points, truth)
+    apart = displacement_m(points[:, :, None] + others, truth[:, None, None])
+    flags = instants["flags"]
+    complete = flags & COMPLETE > 0
+    return Figures(
+        time=instants["time"],
+        complete=complete,
+        settled=flags & SETTLED > 0,
+        newly=flags & NEWLY > 0,
+        dispersion=dispersion(points),
+        convergence_s=np.stack([convergence_s(errors_m, range_m) for range_m in RANGES_M], axis=1),
+        errors_m=errors_m,
+        nearest=errors_m <= np.where(np.isnan(apart), np.inf, apart).min(axis=2),
+    )
+
+
+def _at_the_instant(time: Floats, made_at: Floats, points: Floats, others: Floats) -> tuple[Floats, Floats]:
+    """Forecasts read at the very instant: between steps linearly, behind the last one straight on.
+
+    Args:
+        time: [P], s.
+        made_at: [P, A], s.
+        points: [P, A, 3, 2], m, at the steps before, at and after the age; the last NaN where there is none.
+        others: [P, A, 3, M, 2], m, relative to the points.
+
+    Returns:
+        [P, A, 2] and [P, A, M, 2], m.
+    """
+    late = (time[:, None] - made_at - AGES_S) / STEP_SECONDS  # steps, mostly 0
+    weight = np.where(np.abs(late) <= TIME_TOLERANCE / STEP_SECONDS, 0.0, late)
+
+    def read(values: Floats) -> Floats:
+        w = weight.reshape(weight.shape + (1,) * (values.ndim - 3))
+        before, at, after = values[:, :, 0], values[:, :, 1], values[:, :, 2]
+        forward = np.where(np.isnan(after), at - before, after - at)
+        slope = np.where(w < 0, at - before, np.where(w > 0, forward, 0.0))
+        result: Floats = at + np.where(w == 0, 0.0, w * slope)
+        return result
+
+    return read(points), read(others.astype(np.float64))

@@ -1,0 +1,172 @@
+"""The calls about consistency, from request message to answer message; the transports only carry them."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Sequence
+
+import numpy as np
+
+from cab.forecast.v1 import consistency_service_pb2 as pb
+from service.consistency.figures import Figures, figures
+from service.consistency.messages import ReferenceOf, instant_messages, model_messages
+from service.consistency.sums import Sums
+from service.consistency.tracker import PATIENCE
+from service.errors import BadField, Overloaded, TrackingUnavailable, UnknownTrack
+from service.history.guard import Guard
+from service.history.store import WINDOW, Remembered, StoreError, TrackStore
+from service.history.stores import MAX_WATCHERS
+from service.limits import MAX_ID_LENGTH
+
+DEFAULT_WINDOW = 2.0
+"""s back from an agent's newest observation."""
+_WATCH_RETRY = 5.0
+"""s until a place among the watchers may be free."""
+
+
+class ConsistencyPlane:
+    """What the track memory tells those who ask for it.
+
+    Args:
+        store: the memory.
+        guard: of the calls to it.
+        sums: over the process's life.
+        reference_of: a series' model.
+        require_ready: raises ``Unavailable`` while calls are not taken.
+    """
+
+    def __init__(
+        self,
+        store: TrackStore,
+        guard: Guard,
+        sums: Sums,
+        reference_of: ReferenceOf,
+        require_ready: Callable[[], object],
+    ) -> None:
+        self._store = store
+        self._guard = guard
+        self._sums = sums
+        self._reference_of = reference_of
+        self._require_ready = require_ready
+        self._watchers = 0
+        self._ended = asyncio.Event()
+
+    async def get_agent(self, request: pb.GetAgentConsistencyRequest) -> pb.GetAgentConsistencyResponse:
+        """One agent's last seconds.
+
+        Raises:
+            BadField: an id is missing or too long, or the window is out of its range.
+            UnknownTrack: nothing is remembered of it.
+            TrackingUnavailable: the track memory does not answer.
+            Unavailable: not ready.
+        """
+        self._require_ready()
+        _check_id("scene_id", request.scene_id)
+        _check_id("agent_id", request.agent_id)
+        if not 0 <= request.window <= WINDOW:
+            raise BadField("window", f"must be within 0 … {WINDOW:g} s")
+        held = await self._read(request.scene_id, request.agent_id)
+        found = figures(held.instants.packed)
+        if not len(found):
+            return pb.GetAgentConsistencyResponse()
+        since = found.time.max() - (request.window or DEFAULT_WINDOW)
+        chosen = np.flatnonzero(found.time >= since).tolist()
+        return pb.GetAgentConsistencyResponse(instants=self._messages(found, held, chosen))
+
+    async def get_scene(self, request: pb.GetSceneConsistencyRequest) -> pb.GetSceneConsistencyResponse:
+        """A scene now. Raises as ``get_agent``."""
+        self._require_ready()
+        _check_id("scene_id", request.scene_id)
+        held = await self._read(request.scene_id, None)
+        found = figures(held.instants.packed)
+        newest: dict[tuple[str, str], int] = {}
+        for row, key in enumerate(zip(held.instants.agent_ids, held.instants.series, strict=True)):
+            newest[key] = row  # by ascending time: the last one stays
+        sums = Sums()
+        sums.add(found, held.instants.series, newly_only=False)
+        return pb.GetSceneConsistencyResponse(
+            latest=self._messages(found, held, [newest[key] for key in sorted(newest)]),
+            models=model_messages(sums, self._reference_of),
+        )
+
+    async def list_models(self, request: pb.ListModelConsistencyRequest) -> pb.ListModelConsistencyResponse:
+        """Sums over the process's life.
+
+        Raises:
+            Unavailable: not ready.
+        """
+        self._require_ready()
+        return pb.ListModelConsistencyResponse(models=model_messages(self._sums, self._reference_of))
+
+    async def reset_scene(self, request: pb.ResetSceneRequest) -> pb.ResetSceneResponse:
+        """Forgets a scene.
+
+        Raises:
+            BadField, TrackingUnavailable, Unavailable: as ``get_agent``.
+        """
+        self._require_ready()
+        _check_id("scene_id", request.scene_id)
+        try:
+            agents = await self._guard.run("reset", lambda: self._store.reset(request.scene_id), PATIENCE)
+        except StoreError as error:
+            raise TrackingUnavailable(str(error)) from error
+        return pb.ResetSceneResponse(agents=agents)
+
+    async def watch_scene(self, request: pb.WatchSceneRequest) -> AsyncIterator[pb.WatchSceneResponse]:
+        """Events of a scene until the caller closes the iterator or the server drains.
+
+        Raises:
+            BadField, TrackingUnavailable, Unavailable: as ``get_agent``.
+            Overloaded: too many watch.
+        """
+        self._require_ready()
+        _check_id("scene_id", request.scene_id)
+        if self._watchers >= MAX_WATCHERS:
+            raise Overloaded(f"{self._watchers} calls watch already", _WATCH_RETRY)
+        self._watchers += 1
+        source = self._store.watch(request.scene_id)
+        ended = asyncio.ensure_future(self._ended.wait())
+        try:
+            while not self._ended.is_set():
+                coming = asyncio.ensure_future(anext(source))
+                try:
+                    await asyncio.wait({coming, ended}, return_when=asyncio.FIRST_COMPLETED)
+                    if not coming.done():
+                        return
+                    events, missed = coming.result()
+                finally:
+                    coming.cancel()
+                    await asyncio.gather(coming, return_exceptions=True)
+                instants = [pb.InstantConsistency.FromString(event) for event in events]
+                yield pb.WatchSceneResponse(instants=instants, missed=missed)
+        except StopAsyncIteration:
+            return
+        except StoreError as error:
+            raise TrackingUnavailable(str(error)) from error
+        finally:
+            self._watchers -= 1
+            ended.cancel()
+            await source.aclose()
+
+    def end_watching(self) -> None:
+        """Ends all that watch."""
+        self._ended.set()
+
+    async def _read(self, scene_id: str, agent_id: str | None) -> Remembered:
+        try:
+            held = await self._guard.run("read", lambda: self._store.read(scene_id, agent_id), PATIENCE)
+        except StoreError as error:
+            raise TrackingUnavailable(str(error)) from error
+        if not held.agent_ids:
+            whose = "this scene" if agent_id is None else "this agent"
+            raise UnknownTrack(f"nothing is remembered of {whose}")
+        return held
+
+    def _messages(self, found: Figures, held: Remembered, rows: Sequence[int]) -> list[pb.InstantConsistency]:
+        messages = instant_messages(found, held.instants.agent_ids, held.instants.series, self._reference_of)
+        return [messages[row] for row in rows]
+
+
+def _check_id(field: str, value: str) -> None:
+    if not value:
+        raise BadField(field, "is required")
+    if len(value) > MAX_ID_LENGTH:
+        raise BadField(field, f"has {len(value)} characters; at most {MAX_ID_LENGTH}")

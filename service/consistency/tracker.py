@@ -1,0 +1,146 @@
+"""The track memory as the calls of Predict use it: never in the way of a forecast."""
+
+import asyncio
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from time import perf_counter
+
+from cab.forecast.v1 import consistency_service_pb2 as pb
+from service.consistency.figures import figures
+from service.consistency.messages import ReferenceOf, instant_messages
+from service.consistency.statuses import OF_AGENT, OF_SCENE
+from service.consistency.sums import Sums
+from service.history.guard import Guard
+from service.history.store import Recalled, Sighting, StoreError, TrackStore
+
+PATIENCE = 2.0
+"""s that those who do not forecast wait for the track memory."""
+
+
+@dataclass
+class Tracked:
+    """What the memory said in one call."""
+
+    status: "pb.TrackingStatus.ValueType" = pb.TRACKING_STATUS_UNAVAILABLE
+    agents: "dict[str, pb.TrackingStatus.ValueType]" = field(default_factory=dict)
+    """By id; empty where the memory did not answer."""
+    histories: dict[str, bytes] = field(default_factory=dict)
+    """By id, if they were asked for."""
+    latest: dict[str, pb.InstantConsistency] = field(default_factory=dict)
+    """By id: the newest observation, if it was asked for."""
+    seconds: float = 0.0
+    """s that the call waited for it."""
+
+
+class Tracker:
+    """Remembers what calls bring, and counts what it finds out.
+
+    Args:
+        store: the memory.
+        guard: of the calls to it.
+        budget: s that a call waits for the memory.
+        reference_of: a series' model.
+    """
+
+    def __init__(
+        self,
+        store: TrackStore,
+        guard: Guard,
+        budget: float,
+        reference_of: ReferenceOf,
+    ) -> None:
+        self.sums = Sums()
+        self._store = store
+        self._guard = guard
+        self._budget = budget
+        self._reference_of = reference_of
+        self._telling: set[asyncio.Task[None]] = set()
+
+    async def exchange(
+        self,
+        scene_id: str,
+        time: float,
+        sightings: Sequence[Sighting],
+        recall: float | None = None,
+        latest: bool = False,
+    ) -> Tracked:
+        """Remembers what a call brings; says so where the memory does not answer in time.
+
+        Args:
+            scene_id: of the call.
+            time: of the call, s.
+            sightings: its agents.
+            recall: s of history that are wanted; None: none is.
+            latest: whether the consistency at the newest observations is wanted.
+        """
+        started = perf_counter()
+        tracked = Tracked()
+
+        def take_late(recalled: Recalled) -> None:
+            self._take(scene_id, recalled, latest=False)
+
+        try:
+            recalled = await self._guard.run(
+                "exchange",
+                lambda: self._store.exchange(scene_id, time, sightings, recall),
+                self._budget,
+                late=take_late,
+            )
+        except StoreError:
+            tracked.seconds = perf_counter() - started
+            return tracked
+        messages = self._take(scene_id, recalled, latest)
+        tracked.status = OF_SCENE[recalled.event]
+        ids = [one.agent_id for one in sightings]
+        tracked.agents = {one: OF_AGENT[fate] for one, fate in zip(ids, recalled.fates, strict=True)}
+        tracked.histories = dict(zip(ids, recalled.histories, strict=False))
+        tracked.latest = _newest(sightings, recalled.instants.series, messages) if latest else {}
+        tracked.seconds = perf_counter() - started
+        return tracked
+
+    def _take(self, scene_id: str, recalled: Recalled, latest: bool) -> list[pb.InstantConsistency]:
+        """Counts what was settled and tells those who watch; messages of all instants, if they are wanted."""
+        instants = recalled.instants
+        if not instants.series:
+            return []
+        found = figures(instants.packed)
+        if found.newly.any():
+            self.sums.add(found, instants.series, newly_only=True)
+        if not (latest or recalled.watched):
+            return []
+        messages = instant_messages(found, instants.agent_ids, instants.series, self._reference_of)
+        if recalled.watched:
+            self._tell(scene_id, [message.SerializeToString() for message in messages])
+        return messages
+
+    def _tell(self, scene_id: str, events: Sequence[bytes]) -> None:
+        """Tells those who watch; no call waits for it."""
+        telling = asyncio.create_task(
+            self._guard.run("publish", lambda: self._store.publish(scene_id, events), PATIENCE)
+        )
+        self._telling.add(telling)
+        telling.add_done_callback(self._told)
+
+    def _told(self, telling: "asyncio.Task[None]") -> None:
+        self._telling.discard(telling)
+        if not telling.cancelled():
+            telling.exception()  # looked at: the guard has counted it
+
+
+def _newest(
+    sightings: Sequence[Sighting], series: Sequence[str], messages: Sequence[pb.InstantConsistency]
+) -> dict[str, pb.InstantConsistency]:
+    """Of each agent the last instant of the series that the call is about.
+
+    Args:
+        sightings: what the call brought.
+        series: of each message.
+        messages: of all that the memory told.
+    """
+    asked = {one.agent_id: one.series for one in sightings}
+    newest: dict[str, pb.InstantConsistency] = {}
+    for name, message in zip(series, messages, strict=True):
+        known = newest.get(message.agent_id)
+        if asked.get(message.agent_id) == name and (known is None or message.time > known.time):
+            newest[message.agent_id] = message
+    return newest

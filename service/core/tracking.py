@@ -1,0 +1,110 @@
+"""What of a call goes into the track memory, and what comes out of it for a call."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
+from cab.forecast.v1 import prediction_service_pb2 as pb
+from model.forecaster import Context, Forecaster
+from service.consistency.tracker import Tracked
+from service.core.agents import Agents
+from service.core.encode import Result
+from service.core.plan import Plan
+from service.history.records import KINDS, pack_forecasts, pack_observations, unpack_observations
+from service.history.store import Sighting
+
+
+def series_of(forecaster: Forecaster) -> str:
+    """Under what a model's forecasts are remembered."""
+    return f"{forecaster.info.name}@{forecaster.info.version}"
+
+
+def observed(agents: Agents, models: tuple[Forecaster, Forecaster]) -> list[Sighting]:
+    """All that a call says of its agents, before they are forecast.
+
+    Args:
+        agents: of the call.
+        models: the one that is asked for, and the fallback.
+    """
+    forecaster, fallback = models
+    if agents.observations is None:
+        return []
+    packed = pack_observations(agents.observations, newest_only=False)
+    return [
+        Sighting(
+            agents.ids[index],
+            KINDS[kind],
+            observations,
+            series_of(forecaster if kind in forecaster.info.agent_types else fallback),
+        )
+        for index, kind, observations in zip(agents.valid.tolist(), agents.types, packed, strict=True)
+    ]
+
+
+def with_histories(agents: Agents, histories: Mapping[str, bytes]) -> Agents:
+    """Agents with what the memory recalls of them.
+
+    Args:
+        agents: of the call.
+        histories: by id, each with the call's own observations; empty where the memory did not answer.
+    """
+    if agents.observations is None or not histories:
+        return agents
+    own = pack_observations(agents.observations, newest_only=False)
+    packed = [
+        histories.get(agents.ids[index]) or alone
+        for index, alone in zip(agents.valid.tolist(), own, strict=True)
+    ]
+    return replace(agents, observations=unpack_observations(packed))
+
+
+def sightings(plan: Plan, results: Sequence[Result]) -> list[Sighting]:
+    """What a call brings: forecasts but for blind ones, and each agent's newest observation, unless it was
+    remembered when histories were recalled.
+
+    Args:
+        plan: of the call.
+        results: the forecasts that were made.
+    """
+    agents = plan.agents
+    made: dict[int, tuple[str, bytes]] = {}
+    if plan.options.context is not Context.BLIND:
+        for result in results:
+            for draft, forecast in zip(result.drafts, pack_forecasts(result.mixture), strict=True):
+                if draft.forecaster is not None:
+                    made[draft.index] = series_of(draft.forecaster), forecast
+    if agents.observations is None:
+        return []
+    packed = pack_observations(agents.observations, newest_only=True)
+    brought = []
+    for index, kind, newest in zip(agents.valid.tolist(), agents.types, packed, strict=True):
+        series, forecast = made.get(index, ("", b""))
+        if plan.options.recalls and not forecast:
+            continue  # was remembered before
+        observations = b"" if plan.options.recalls else newest
+        steps = plan.options.steps if forecast else 0
+        brought.append(Sighting(agents.ids[index], KINDS[kind], observations, series, forecast, steps))
+    return brought
+
+
+def report(response: pb.PredictResponse, before: Tracked | None, after: Tracked) -> None:
+    """Puts what the memory said into the answer.
+
+    Args:
+        response: the answer.
+        before: of the time before the forecasts, if histories were recalled.
+        after: of the time when they were brought.
+    """
+    first = before or after
+    lost = consistency_pb.TRACKING_STATUS_UNAVAILABLE
+    response.tracking = lost if lost in (first.status, after.status) else first.status
+    response.timing.tracking = after.seconds + (before.seconds if before is not None else 0.0)
+    for forecast in response.forecasts:
+        if forecast.status == pb.FORECAST_STATUS_INVALID and forecast.agent_id not in first.agents:
+            continue
+        forecast.tracking = (
+            lost if response.tracking == lost else first.agents.get(forecast.agent_id, first.status)
+        )
+        latest = first.latest.get(forecast.agent_id)
+        if latest is not None and latest.model == forecast.model:
+            forecast.consistency.CopyFrom(latest)

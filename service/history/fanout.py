@@ -1,0 +1,70 @@
+"""Events to those who watch a scene, within one process."""
+
+import asyncio
+from collections import deque
+from collections.abc import AsyncGenerator, Sequence
+
+BACKLOG = 1024
+"""Events that a reader may be behind."""
+
+
+class _Reader:
+    def __init__(self) -> None:
+        self.events: deque[bytes] = deque()
+        self.missed = 0
+        self.ready = asyncio.Event()
+
+    def add(self, events: Sequence[bytes]) -> None:
+        self.events.extend(events)
+        while len(self.events) > BACKLOG:
+            self.events.popleft()
+            self.missed += 1
+        self.ready.set()
+
+    def take(self) -> tuple[Sequence[bytes], int]:
+        self.ready.clear()
+        events, missed = list(self.events), self.missed
+        self.events.clear()
+        self.missed = 0
+        return events, missed
+
+
+class Fanout:
+    """Hands events on; a reader that is slow loses the oldest and holds nobody up."""
+
+    def __init__(self) -> None:
+        self._readers: dict[str, set[_Reader]] = {}
+        self._closed = asyncio.Event()
+
+    def watched(self, scene_id: str) -> bool:
+        """Whether anybody watches a scene."""
+        return scene_id in self._readers
+
+    def publish(self, scene_id: str, events: Sequence[bytes]) -> None:
+        """Gives events to all who watch the scene now."""
+        for reader in self._readers.get(scene_id, ()):
+            reader.add(events)
+
+    async def watch(self, scene_id: str) -> AsyncGenerator[tuple[Sequence[bytes], int], None]:
+        """Nothing at first, as soon as it watches; then events, and how many this reader lost before them."""
+        reader = _Reader()
+        self._readers.setdefault(scene_id, set()).add(reader)
+        try:
+            yield (), 0
+            while not self._closed.is_set():
+                await reader.ready.wait()
+                events, missed = reader.take()
+                if events:
+                    yield events, missed
+        finally:
+            readers = self._readers[scene_id]
+            readers.discard(reader)
+            if not readers:
+                del self._readers[scene_id]
+
+    def close(self) -> None:
+        """Ends all that watch."""
+        self._closed.set()
+        for readers in self._readers.values():
+            for reader in readers:
+                reader.ready.set()

@@ -1,0 +1,78 @@
+"""One scene's memory: a state that the calls of the scene change one after the other.
+
+It depends on nothing but these calls and their order. So the memory in this process and the one in Redis,
+where the calls are written down in one order for all servers, are the same.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from service.history.entry import Entry
+from service.history.store import WINDOW, Fate
+from service.history.track import Instant, Track
+
+
+@dataclass
+class Outcome:
+    """What one call led to."""
+
+    fates: list[Fate] = field(default_factory=list)
+    """Of each of its agents."""
+    histories: list[bytes] = field(default_factory=list)
+    """Of each of its agents, if they were asked for."""
+    instants: list[Instant] = field(default_factory=list)
+    """What there is to be told."""
+
+
+class SceneMemory:
+    """The agents of a scene, each as long as it was seen within the window of the scene's newest call."""
+
+    def __init__(self) -> None:
+        self._newest = float("-inf")
+        self._tracks: dict[str, Track] = {}
+
+    def __len__(self) -> int:
+        return len(self._tracks)
+
+    @property
+    def cut(self) -> float:
+        """s; of what was before it nothing is remembered."""
+        return self._newest - WINDOW
+
+    def apply(self, entry: Entry, recall: float | None = None) -> Outcome:
+        """Remembers what a call brings.
+
+        Args:
+            entry: the call.
+            recall: s of history that are wanted; None: none is.
+        """
+        outcome = Outcome()
+        gone: Sequence[str] = ()
+        if entry.time < self.cut:  # its clock jumped back, or it plays again
+            gone = tuple(self._tracks)
+            self._tracks.clear()
+            self._newest = entry.time
+        self._newest = max(self._newest, entry.time)
+        self._forget(self.cut)
+        for sighting in entry.sightings:
+            track = self._tracks.get(sighting.agent_id)
+            fate = Fate.RESET if sighting.agent_id in gone else Fate.NEW if track is None else Fate.KEPT
+            if track is not None and not track.fits(sighting):
+                track, fate = None, Fate.RESET
+            if track is None:
+                track = self._tracks[sighting.agent_id] = Track(sighting.kind)
+            outcome.fates.append(fate)
+            outcome.instants.extend(track.exchange(sighting, entry.time, self.cut))
+            if recall is not None:
+                outcome.histories.append(track.history(entry.time, recall))
+        return outcome
+
+    def everything(self, agent_id: str | None = None) -> tuple[list[str], list[Instant]]:
+        """Ids of all agents, or of one if it is remembered, and every observation's set of every series."""
+        ids = list(self._tracks) if agent_id is None else [one for one in (agent_id,) if one in self._tracks]
+        return ids, [instant for one in ids for instant in self._tracks[one].everything(one)]
+
+    def _forget(self, cut: float) -> None:
+        gone = [agent_id for agent_id, track in self._tracks.items() if track.newest < cut]
+        for agent_id in gone:
+            del self._tracks[agent_id]

@@ -1,0 +1,67 @@
+"""Sightings to feed a memory with: an agent on a straight line, and forecasts that miss by a known offset."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from model.arrays import Floats
+from service.history.records import BLOCK, FORECAST_BLOCKS, OBSERVATION_FIELDS
+from service.history.store import Sighting
+
+SERIES = "cab@1.0.0"
+START = 1.6e9
+"""s."""
+
+
+def observation(time: float, position: tuple[float, float]) -> bytes:
+    """One observation of nothing but a position."""
+    values = np.full(OBSERVATION_FIELDS, np.nan)
+    values[:3] = time, *position
+    return values.tobytes()
+
+
+def forecast(path: Floats) -> bytes:
+    """A forecast of one mode: [T + 1, 2], m, from now on."""
+    blocks = np.full(FORECAST_BLOCKS, np.nan, dtype=BLOCK)
+    blocks["point"][: len(path)] = path
+    return blocks.tobytes()
+
+
+def where(time: float, speed: float = 10.0, off: float = 0.0) -> tuple[float, float]:
+    """Where the agent is at a time, m."""
+    return speed * (time - START), off
+
+
+def sighting(
+    time: float,
+    agent_id: str = "a",
+    *,
+    series: str = SERIES,
+    kind: bytes = b"v",
+    speed: float = 10.0,
+    off: float = 0.0,
+    miss: float = 0.0,
+    steps: int = 12,
+) -> Sighting:
+    """An agent seen and forecast at a time.
+
+    Args:
+        time: s.
+        agent_id: its id.
+        series: of the forecast; empty: there is none.
+        kind: of agent.
+        speed: m/s, along x.
+        off: m, its y.
+        miss: m that the forecast is beside the path, in y.
+        steps: of the forecast.
+    """
+    path = np.array([where(time + 0.5 * k, speed, off) for k in range(steps + 1)])
+    path[1:, 1] += miss
+    made = forecast(path) if series else b""
+    at = where(time, speed, off)
+    return Sighting(agent_id, kind, observation(time, at), series, made, steps if series else 0)
+
+
+def times(count: int, step: float = 0.5, first: float = START) -> Sequence[float]:
+    """So many times, s."""
+    return [first + step * number for number in range(count)]

@@ -1,0 +1,43 @@
+"""Stores to test, on real servers."""
+
+import uuid
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+from service.history.address import parse_address
+from service.history.connection import connect
+from service.history.memory import MemoryStore
+from service.history.redis_store import RedisStore
+from service.history.store import TrackStore
+
+EXPIRY = 30.0
+MAX_AGENTS = 10_000
+
+
+@asynccontextmanager
+async def opened(
+    url: str, expiry: float = EXPIRY, max_agents: int = MAX_AGENTS, timeout_s: float = 5.0
+) -> AsyncIterator[RedisStore]:
+    """A store on Redis."""
+    address = parse_address(url)
+    store = RedisStore(
+        connect(address, timeout_s=timeout_s, connections=8),
+        connect(address, timeout_s=10.0, connections=8),
+        expiry,
+        max_agents,
+    )
+    await store.open()
+    try:
+        yield store
+    finally:
+        await store.close()
+
+
+def memory() -> TrackStore:
+    """The store in this process."""
+    return MemoryStore(EXPIRY, MAX_AGENTS)
+
+
+def scene_name() -> str:
+    """A scene that no other test has."""
+    return f"scene {uuid.uuid4().hex}"

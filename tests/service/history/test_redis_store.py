@@ -1,0 +1,286 @@
+"""What is of Redis alone: several servers on one log, and whatever happens to it."""
+
+import asyncio
+import random
+from collections.abc import AsyncIterator, Sequence
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from redis.exceptions import OutOfMemoryError
+
+from service.history.keys import SceneKeys
+from service.history.records import NEWLY, unpack_instants
+from service.history.redis_store import MAX_ENTRIES, RedisStore
+from service.history.store import Event, Fate, Recalled, TrackStore
+from tests.service.history.redis_servers import Process, single
+from tests.service.history.sightings import START, sighting, times
+from tests.service.history.stores import memory, opened, scene_name
+
+
+@pytest.fixture
+async def store(redis_server: Process) -> AsyncIterator[RedisStore]:
+    async with opened(redis_server.url) as one:
+        yield one
+
+
+@pytest.fixture
+async def other(redis_server: Process) -> AsyncIterator[RedisStore]:
+    """Another server's."""
+    async with opened(redis_server.url) as one:
+        yield one
+
+
+def rows(answers: Sequence[Recalled]) -> list[bytes]:
+    """What was settled, in order of time and agent."""
+    found = []
+    for answer in answers:
+        told = answer.instants
+        for row, agent_id, series in zip(
+            unpack_instants(told.packed), told.agent_ids, told.series, strict=True
+        ):
+            if row["flags"] & NEWLY:
+                found.append((float(row["time"]), agent_id, series, row.tobytes()))
+    return [row for *_, row in sorted(found)]
+
+
+async def replay(stores: Sequence[TrackStore], scene: str, moments: Sequence[float]) -> list[Recalled]:
+    """Calls to the stores in turn."""
+    return [
+        await stores[number % len(stores)].exchange(
+            scene, t, [sighting(t), sighting(t, "b", off=9.0, miss=1.0)]
+        )
+        for number, t in enumerate(moments)
+    ]
+
+
+def number(server: Process, *words: str) -> int:
+    """The answer to a command, which is a number."""
+    answer = server.command(*words)
+    assert isinstance(answer, int)
+    return answer
+
+
+async def test_two_servers_in_turn_are_as_one(store: RedisStore, other: RedisStore) -> None:
+    rng = random.Random(3)
+    moments = sorted(times(60), key=lambda t: t + rng.uniform(0, 1.5))
+    scene = scene_name()
+    together = await replay([store, other, other, store, store], scene, moments)
+    assert rows(together) == rows(await replay([memory()], scene, moments))
+    assert (await store.read(scene)).instants == (await other.read(scene)).instants
+
+
+async def test_a_server_that_starts_midway_knows_all(store: RedisStore, redis_server: Process) -> None:
+    moments = times(30)
+    scene = scene_name()
+    answers = await replay([store], scene, moments[:20])
+    async with opened(redis_server.url) as fresh:
+        answers += await replay([fresh], scene, moments[20:])
+    assert [answer.event for answer in answers] == [Event.BEGUN] + [Event.KEPT] * 29
+    assert rows(answers) == rows(await replay([memory()], scene, moments))
+
+
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.lists(
+        st.tuples(
+            st.integers(0, 1),
+            st.integers(0, 40),
+            st.sampled_from(["a", "b"]),
+            st.sampled_from(["m@1", "n@1"]),
+            st.sampled_from([0.0, 0.0, 0.0, 0.03, 300.0]),
+            st.sampled_from([b"v", b"v", b"v", b"p"]),
+        ),
+        max_size=50,
+    )
+)
+async def test_whatever_comes_both_memories_say_the_same(
+    store: RedisStore,
+    other: RedisStore,
+    calls: list[tuple[int, int, str, str, float, bytes]],
+) -> None:
+    scene, alone = scene_name(), memory()
+    for server, number, agent_id, series, off, kind in calls:
+        t = START + 0.5 * number + (off if off < 1 else 0.0)
+        brought = [sighting(t, agent_id, series=series, off=off, kind=kind)]
+        expected = await alone.exchange(scene, t, brought, recall=3.0)
+        answer = await (store, other)[server].exchange(scene, t, brought, recall=3.0)
+        assert (answer.fates, answer.histories) == (expected.fates, expected.histories)
+        assert answer.instants == expected.instants
+    assert (await other.read(scene)).instants == (await alone.read(scene)).instants
+
+
+async def test_one_round_trip_a_call(redis_server: Process, store: RedisStore) -> None:
+    scene = scene_name()
+    await replay([store], scene, times(2))
+
+    def commands() -> dict[str, int]:
+        lines = redis_server.text("info", "commandstats").splitlines()
+        counts = (line.split("_", 1)[1].split(":calls=") for line in lines if line.startswith("cmdstat_"))
+        return {name: int(rest.split(",")[0]) for name, rest in counts}
+
+    before = commands()
+    await replay([store], scene, times(22)[2:])
+    after = commands()
+    # What the script itself calls is counted there, too
+    inside = {"hmget", "hget", "hset", "hdel", "pexpire", "exists", "info"}
+    asked = {name: count - before.get(name, 0) for name, count in after.items() if name not in inside}
+    assert {name: count for name, count in asked.items() if count} == {"evalsha": 20}
+
+
+async def test_a_flushed_script_is_loaded_again(redis_server: Process, store: RedisStore) -> None:
+    scene = scene_name()
+    answers = await replay([store], scene, times(12))
+    redis_server.command("script", "flush")
+    answers += await replay([store], scene, times(13)[12:])
+    assert len(rows(answers)) == 2
+
+
+async def test_a_log_that_is_gone(redis_server: Process, store: RedisStore, other: RedisStore) -> None:
+    scene = scene_name()
+    await replay([store, other], scene, times(12))
+    redis_server.command("del", SceneKeys(scene).log)
+    (answer,) = await replay([store], scene, times(13)[12:])
+    assert (answer.event, answer.fates) == (Event.LOST, [Fate.NEW, Fate.NEW])
+    assert rows([answer]) == []
+    (answer,) = await replay([other], scene, times(14)[13:])
+    assert (answer.event, answer.fates) == (Event.LOST, [Fate.KEPT, Fate.KEPT])
+
+
+async def test_a_reset_by_another_server_is_noticed(store: RedisStore, other: RedisStore) -> None:
+    scene = scene_name()
+    await replay([store, other], scene, times(12))
+    assert await other.reset(scene) == 2
+    (answer,) = await replay([store], scene, times(13)[12:])
+    assert (answer.event, answer.fates) == (Event.LOST, [Fate.NEW, Fate.NEW])
+
+
+async def test_a_log_that_lost_its_end(redis_server: Process, store: RedisStore, other: RedisStore) -> None:
+    """As when a replica takes over that had not got the last entries."""
+    scene = scene_name()
+    log = SceneKeys(scene).log
+    await replay([store], scene, times(12))
+    redis_server.command("hset", log, "l", "10")
+    redis_server.command("hdel", log, "11", "k11", "12", "k12")
+    await replay([other], scene, times(16)[14:15])  # another entry takes the number 11
+    await replay([other], scene, times(17)[15:16])  # and 12
+    (answer,) = await replay([store], scene, times(17)[16:])
+    assert (answer.event, answer.fates) == (Event.LOST, [Fate.KEPT, Fate.KEPT])
+    assert (await store.read(scene)).instants == (await other.read(scene)).instants
+
+
+@pytest.mark.parametrize(
+    "foreign",
+    [
+        ("set", "hello"),
+        ("rpush", "hello"),
+        ("hset", "hello", "world"),
+        ("hset", "f", "1", "l", "hello"),
+        ("hset", "f", "-5", "l", "3"),
+        ("hset", "f", "1", "l", "1e300"),
+    ],
+)
+async def test_something_else_in_its_place(
+    redis_server: Process, store: RedisStore, foreign: tuple[str, ...]
+) -> None:
+    scene = scene_name()
+    command, *words = foreign
+    redis_server.command(command, SceneKeys(scene).log, *words)
+    answers = await replay([store], scene, times(13))
+    assert len(rows(answers)) == 2
+
+
+@pytest.mark.parametrize("damaged", ["", "hello", "\0" * 40])
+async def test_a_damaged_entry_is_left_out(
+    redis_server: Process, store: RedisStore, other: RedisStore, damaged: str
+) -> None:
+    scene = scene_name()
+    await replay([store], scene, times(12))
+    redis_server.command("hset", SceneKeys(scene).log, "5", damaged)
+    (answer,) = await replay([other], scene, times(13)[12:])
+    assert (answer.event, answer.fates) == (Event.KEPT, [Fate.KEPT, Fate.KEPT])
+    held = unpack_instants((await other.read(scene, "a")).instants.packed)
+    assert len(held) == 12  # all but one
+
+
+async def test_a_full_redis_says_so_and_recovers() -> None:
+    with single("--maxmemory-policy", "noeviction") as server:
+        async with opened(server.url) as store:
+            scene = scene_name()
+            answers = await replay([store], scene, times(6))
+            server.command("config", "set", "maxmemory", "1")
+            with pytest.raises(OutOfMemoryError):
+                await replay([store], scene, times(7)[6:])
+            server.command("config", "set", "maxmemory", "0")
+            answers += await replay([store], scene, times(14)[6:])
+            assert len(rows(answers)) == 4
+
+
+async def test_an_entry_whose_answer_was_lost_counts_all_the_same(
+    redis_server: Process, store: RedisStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = scene_name()
+    answers = await replay([store], scene, times(12))
+    run = store._append.run
+
+    async def lose(*arguments: object) -> object:
+        await run(*arguments)  # type: ignore[arg-type]
+        raise TimeoutError
+
+    monkeypatch.setattr(store._append, "run", lose)
+    with pytest.raises(TimeoutError):
+        await replay([store], scene, times(13)[12:])
+    monkeypatch.undo()
+    answers += await replay([store], scene, times(14)[13:])
+    assert rows(answers) == rows(await replay([memory()], scene, times(14)))
+
+
+async def test_the_log_is_bounded_and_expires(redis_server: Process) -> None:
+    scene = scene_name()
+    log = SceneKeys(scene).log
+    async with opened(redis_server.url, expiry=12.0) as store:
+        await replay([store], scene, times(60))
+        # A call a time: 19 of 9 s, and the ones that are dropped with the next call
+        entries = (number(redis_server, "hlen", log) - 2) / 2
+        assert entries <= 20
+        assert 11_000 < number(redis_server, "pttl", log) <= 12_000
+        for agent in range(MAX_ENTRIES + 50):  # all at one time
+            await store.exchange(scene, times(60)[-1], [sighting(times(60)[-1], f"{agent}", series="")])
+        assert (number(redis_server, "hlen", log) - 2) / 2 == MAX_ENTRIES
+
+
+@pytest.mark.parametrize(("step", "most"), [(0.5, 24_000), (0.1, 110_000)])
+async def test_bytes_an_agent(redis_server: Process, store: RedisStore, step: float, most: int) -> None:
+    scene, agents = scene_name(), 32
+    for t in times(round(15 / step), step):
+        await store.exchange(scene, t, [sighting(t, f"agent-{n}", off=9.0 * n) for n in range(agents)])
+    size = number(redis_server, "memory", "usage", SceneKeys(scene).log, "samples", "0")
+    assert size / agents < most
+
+
+async def test_scenes_that_do_not_fit_are_read_again(redis_server: Process) -> None:
+    async with opened(redis_server.url, max_agents=4) as store:
+        scenes = [scene_name() for _ in range(5)]
+        answers: dict[str, list[Recalled]] = {scene: [] for scene in scenes}
+        for t in times(14):
+            for scene in scenes:
+                answers[scene] += await replay([store], scene, [t])
+            assert sum(len(each.memory) for each in store._scenes.values()) <= 4
+        for scene in scenes:
+            assert [answer.event for answer in answers[scene]] == [Event.BEGUN] + [Event.KEPT] * 13
+            assert rows(answers[scene]) == rows(await replay([memory()], scene, times(14)))
+
+
+async def test_a_cancelled_call_leaves_no_trouble(store: RedisStore) -> None:
+    scene = scene_name()
+    rng = random.Random(5)
+    answers: list[Recalled] = []
+    for t in times(40):
+        calls = [asyncio.create_task(store.exchange(scene, t, [sighting(t)])) for _ in range(3)]
+        await asyncio.sleep(rng.uniform(0, 0.0015))
+        calls[1].cancel()
+        done = await asyncio.gather(*calls, return_exceptions=True)
+        answers += [one for one in done if isinstance(one, Recalled)]
+        assert all(isinstance(one, Recalled) for one in (done[0], done[2]))
+    settled = rows(answers)
+    assert len(settled) == len(set(settled)) == 28

@@ -1,0 +1,272 @@
+"""The state machine: which sets settle, when, and what is forgotten."""
+
+import random
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.history.entry import Entry
+from service.history.records import AGES, COMPLETE, NEWLY, SETTLED, unpack_instants
+from service.history.scene import Outcome, SceneMemory
+from service.history.store import MAX_FORECASTS, MAX_SERIES, SETTLE_AFTER, WINDOW, Fate, Sighting
+from service.history.track import bundle
+from tests.service.history.sightings import SERIES, START, observation, sighting, times, where
+
+
+def replay(scene: SceneMemory, moments: list[float], **options: object) -> list[Outcome]:
+    return [scene.apply(Entry(t, [sighting(t, **options)])) for t in moments]  # type: ignore[arg-type]
+
+
+def settled(outcomes: list[Outcome]) -> dict[tuple[str, str, float], np.void]:
+    """What was settled, by agent, series and time; fails where something was settled twice."""
+    found: dict[tuple[str, str, float], np.void] = {}
+    for outcome in outcomes:
+        told = bundle(outcome.instants)
+        for row, agent_id, series in zip(
+            unpack_instants(told.packed), told.agent_ids, told.series, strict=True
+        ):
+            if row["flags"] & NEWLY:
+                key = agent_id, series, float(row["time"])
+                assert key not in found
+                assert row["flags"] == COMPLETE | SETTLED | NEWLY
+                found[key] = row
+    return found
+
+
+def test_a_set_is_complete_from_the_thirteenth_frame_on() -> None:
+    moments = list(times(16))
+    found = settled(replay(SceneMemory(), moments, miss=0.25))
+    assert sorted(time for _, _, time in found) == moments[12:]
+    row = found["a", SERIES, moments[12]]
+    assert row["made_at"].tolist() == moments[11::-1]
+    assert row["position"].tolist() == list(where(moments[12]))
+    at = row["blocks"]["point"][:, 1]
+    assert at.tolist() == [[where(moments[12])[0], 0.25]] * AGES
+
+
+def test_at_ten_hertz_the_lags_are_met_exactly() -> None:
+    moments = list(times(80, 0.1))
+    found = settled(replay(SceneMemory(), moments))
+    assert len(found) == 80 - 60
+    for (_, _, time), row in found.items():
+        assert np.allclose(time - row["made_at"], 0.5 * np.arange(1, AGES + 1), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("step", [0.5, 0.1])
+@pytest.mark.parametrize("late", [1.0, 1.9])
+def test_the_order_of_arrival_makes_no_difference(step: float, late: float) -> None:
+    moments = list(times(round(20 / step), step))
+    in_order = settled(replay(SceneMemory(), moments))
+    rng = random.Random(1)
+    shuffled = sorted(moments, key=lambda t: t + rng.uniform(0, late))
+    assert shuffled != moments
+    found = settled(replay(SceneMemory(), shuffled))
+    assert found.keys() == in_order.keys()
+    assert all(found[key].tobytes() == in_order[key].tobytes() for key in found)
+
+
+def test_a_call_that_comes_twice_counts_once() -> None:
+    moments = [t for t in times(20) for _ in range(2)]
+    once = settled(replay(SceneMemory(), list(times(20))))
+    assert settled(replay(SceneMemory(), moments)).keys() == once.keys()
+
+
+def test_a_second_answer_tells_what_was_settled_but_not_anew() -> None:
+    scene = SceneMemory()
+    replay(scene, list(times(13)))
+    (outcome,) = replay(scene, [times(13)[-1]])
+    (instant,) = unpack_instants(bundle(outcome.instants).packed)
+    assert instant["flags"] == COMPLETE | SETTLED
+
+
+def test_of_one_time_what_came_first_is_kept() -> None:
+    scene = SceneMemory()
+    moments = list(times(13))
+    replay(scene, moments[:12], miss=1.0)
+    replay(scene, moments[:12], miss=7.0)
+    found = settled(replay(scene, moments[12:]))
+    assert found["a", SERIES, moments[12]]["blocks"]["point"][:, 1, 1].tolist() == [1.0] * AGES
+
+
+def test_a_missing_frame_leaves_sets_incomplete() -> None:
+    moments = list(times(40))
+    lost = moments.pop(15)
+    found = settled(replay(SceneMemory(), moments))
+    without = {lost + 0.5 * age for age in range(AGES + 1)}
+    assert {time for _, _, time in found} == set(moments[12:]) - without
+
+
+def test_forecasts_off_their_lags_settle_two_seconds_later() -> None:
+    rng = random.Random(1)
+    moments = [t + rng.uniform(-0.04, 0.04) for t in times(30)]
+    scene = SceneMemory()
+    for number, moment in enumerate(moments):
+        (outcome,) = replay(scene, [moment])
+        found = settled([outcome])
+        due = [t for t in moments[12:number] if moment - t >= SETTLE_AFTER > moments[number - 1] - t]
+        assert [time for _, _, time in found] == due
+        newest = unpack_instants(bundle(outcome.instants).packed)[0]
+        assert newest["flags"] == (COMPLETE if number >= 12 else 0)
+
+
+def test_the_nearest_forecast_is_taken_and_none_beyond_the_tolerance() -> None:
+    scene = SceneMemory()
+    moments = list(times(13))
+    for moment in moments[:12]:
+        replay(scene, [moment - 0.08, moment + 0.04])
+    replay(scene, [moments[12], moments[12] + SETTLE_AFTER])
+    _, instants = scene.everything()
+    rows = unpack_instants(bundle(instants).packed)
+    (row,) = rows[rows["time"] == moments[12]]
+    assert np.allclose(row["made_at"], np.array(moments[11::-1]) + 0.04, rtol=0, atol=1e-6)
+
+    other = SceneMemory()
+    replay(other, [moment + 0.12 for moment in moments[:12]])
+    (outcome,) = replay(other, [moments[12]])
+    (row,) = unpack_instants(bundle(outcome.instants).packed)
+    assert row["flags"] == 0
+    assert np.isnan(row["made_at"]).all()
+
+
+def test_a_shorter_horizon_never_completes_a_set() -> None:
+    scene = SceneMemory()
+    outcomes = replay(scene, list(times(20)), steps=6)
+    assert not settled(outcomes)
+    row = unpack_instants(bundle(outcomes[-1].instants).packed)[0]
+    assert np.isfinite(row["made_at"]).tolist() == [True] * 6 + [False] * 6
+    assert np.isnan(row["blocks"]["point"][5, 2]).all()
+
+
+def test_every_model_has_a_series_of_its_own() -> None:
+    scene = SceneMemory()
+    outcomes: list[Outcome] = []
+    for moment in times(14):
+        for series in ("cab@1.0.0", "kalman@1.0.0"):
+            outcomes += replay(scene, [moment], series=series)
+    found = settled(outcomes)
+    assert {(series, time) for _, series, time in found} == {
+        (series, time) for series in ("cab@1.0.0", "kalman@1.0.0") for time in times(14)[12:]
+    }
+
+
+def test_an_observation_is_the_truth_for_every_series() -> None:
+    """As where an agent falls back to another model for one frame."""
+    scene = SceneMemory()
+    moments = list(times(13))
+    replay(scene, moments[:12])
+    found = settled(replay(scene, moments[12:], series="constant-velocity-yaw@1.0.0"))
+    assert list(found) == [("a", SERIES, moments[12])]
+
+
+def test_agents_are_told_apart() -> None:
+    scene = SceneMemory()
+    outcomes = [
+        scene.apply(Entry(t, [sighting(t, "a", miss=1.0), sighting(t, "b", off=50.0, miss=2.0)]))
+        for t in times(13)
+    ]
+    found = settled(outcomes)
+    time = times(13)[-1]
+    assert found["a", SERIES, time]["blocks"]["point"][0, 1].tolist() == [where(time)[0], 1.0]
+    assert found["b", SERIES, time]["blocks"]["point"][0, 1].tolist() == [where(time)[0], 52.0]
+
+
+def test_another_type_begins_anew() -> None:
+    scene = SceneMemory()
+    first = replay(scene, list(times(12)))
+    assert [outcome.fates for outcome in first] == [[Fate.NEW]] + [[Fate.KEPT]] * 11
+    (outcome,) = replay(scene, [times(13)[-1]], kind=b"p")
+    assert outcome.fates == [Fate.RESET]
+    assert not settled([outcome])
+
+
+@pytest.mark.parametrize("off", [60.0, 1e6])
+def test_an_id_that_another_agent_has_begins_anew(off: float) -> None:
+    scene = SceneMemory()
+    replay(scene, list(times(12)))
+    (outcome,) = replay(scene, [times(13)[-1]], off=off)
+    assert outcome.fates == [Fate.RESET]
+    assert not settled([outcome])
+
+
+def test_a_contradiction_at_one_time_begins_anew_but_noise_does_not() -> None:
+    scene = SceneMemory()
+    replay(scene, list(times(3)))
+    assert [o.fates for o in replay(scene, [times(3)[-1]], off=4.9)] == [[Fate.KEPT]]
+    assert [o.fates for o in replay(scene, [times(3)[-1]], off=5.1)] == [[Fate.RESET]]
+
+
+def test_a_clock_that_jumps_back_begins_anew() -> None:
+    scene = SceneMemory()
+    replay(scene, list(times(20)))
+    back = [t - 3600.0 for t in times(13)]
+    outcomes = replay(scene, back)
+    assert [outcome.fates[0] for outcome in outcomes] == [Fate.RESET] + [Fate.KEPT] * 12
+    assert [time for _, _, time in settled(outcomes)] == [back[-1]]
+
+
+def test_what_is_older_than_the_window_is_forgotten() -> None:
+    scene = SceneMemory()
+    replay(scene, list(times(12)))
+    far = START + 5.5 + WINDOW + 0.1
+    scene.apply(Entry(far, [sighting(far, "b")]))
+    assert scene.everything()[0] == ["b"]
+    (outcome,) = replay(scene, [far])
+    assert outcome.fates == [Fate.NEW]
+
+
+def test_memory_is_bounded() -> None:
+    scene = SceneMemory()
+    for number, moment in enumerate(times(3000, 0.01)):
+        scene.apply(Entry(moment, [sighting(moment, series=f"m@{number % (MAX_SERIES + 5)}")]))
+    track = scene._tracks["a"]
+    assert len(track._series) == MAX_SERIES
+    assert all(len(series.times) <= MAX_FORECASTS for series in track._series.values())
+    assert all(series.times == sorted(series.forecasts) for series in track._series.values())
+    assert len(track._observations) <= WINDOW / 0.01 + 1
+
+
+def test_histories_are_what_was_seen_up_to_the_call() -> None:
+    scene = SceneMemory()
+    moments = list(times(10))
+    for moment in moments:
+        scene.apply(Entry(moment, [sighting(moment, series="")]))
+
+    def recalled(time: float, recall: float) -> list[float]:
+        brought = Sighting("a", b"v", observation(time, where(time)))
+        (history,) = scene.apply(Entry(time, [brought]), recall=recall).histories
+        return np.frombuffer(history).reshape(-1, 9)[:, 0].tolist()  # type: ignore[no-any-return]
+
+    assert recalled(moments[-1] + 0.5, 2.0) == [*moments[-4:], moments[-1] + 0.5]
+    assert recalled(moments[4], 1.0) == moments[2:5]  # a late call sees nothing of what came after it
+    assert recalled(moments[-1] + 0.5, 0.0) == [moments[-1] + 0.5]
+
+
+def test_all_that_a_call_brings_goes_into_the_history() -> None:
+    scene = SceneMemory()
+    moments = list(times(4))
+    packed = b"".join(observation(t, where(t)) for t in moments)
+    outcome = scene.apply(Entry(moments[-1], [Sighting("a", b"v", packed)]), recall=5.0)
+    assert outcome.histories == [packed]
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.integers(0, 60), st.sampled_from("ab"), st.sampled_from(["m@1", "n@1"]), st.floats(-0.05, 0.05)
+        ),
+        max_size=60,
+    )
+)
+def test_nothing_is_settled_twice_or_without_every_age(
+    calls: list[tuple[int, str, str, float]],
+) -> None:
+    scene = SceneMemory()
+    outcomes = []
+    for number, agent_id, series, jitter in calls:
+        t = START + 0.5 * number + jitter
+        outcomes.append(scene.apply(Entry(t, [sighting(t, agent_id, series=series, speed=1.0)])))
+    for row in settled(outcomes).values():
+        ages = row["time"] - row["made_at"]
+        assert (np.abs(ages - 0.5 * np.arange(1, AGES + 1)) <= 0.0902).all()
