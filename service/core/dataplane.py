@@ -28,6 +28,7 @@ from service.core.encode import Result, encode, finite
 from service.core.incoming import Encoded, Reader
 from service.core.options import Options, read_options
 from service.core.plan import Draft, Group, Plan, check_strict, fall_back, frames_of, make_plan
+from service.core.road import count_off_road
 from service.core.threads import set_helper_threads
 from service.core.tracking import observed, report, sightings, with_histories
 from service.core.warmup import warm_up
@@ -242,7 +243,7 @@ class DataPlane:
         seed = 0
         if options.samples:
             seed = secrets.randbits(32) if options.seed is None else options.seed
-        encoding = self._in_thread(encode, plan, results, outcomes, seed)
+        encoding = self._in_thread(self._encode, plan, results, outcomes, seed)
         if not options.scene_id:
             response = await encoding
         else:
@@ -252,6 +253,15 @@ class DataPlane:
             report(response, before, after)
         self._count_agents(plan)
         return response
+
+    def _encode(
+        self, plan: Plan, results: Sequence[Result], outcomes: Sequence[Outcome], seed: int
+    ) -> pb.PredictResponse:
+        """The answer, and a look at the road. In a thread: it takes milliseconds."""
+        raster = None if plan.scene is None else plan.scene.raster
+        for name, count in count_off_road(raster, results).items():
+            self._metrics.off_road.labels(name).inc(count)
+        return encode(plan, results, outcomes, seed)
 
     async def _recall(
         self, request: pb.PredictRequest, options: Options, forecaster: Forecaster, catalog: Catalog

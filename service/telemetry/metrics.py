@@ -67,6 +67,12 @@ class Metrics:
             ["model", "status"],
             registry=self.registry,
         )
+        self.off_road = Counter(
+            "forecast_off_road_total",
+            "Forecasts whose most likely trajectory leaves the driveable area of the scene's raster.",
+            ["model"],
+            registry=self.registry,
+        )
         self.nonfinite = Counter(
             "forecast_nonfinite_total",
             "Forecasts thrown away because the model gave a number that is not finite.",
