@@ -4,11 +4,7 @@ The server has one learned model, a CAB network of seeded random weights unless 
 is given; it runs the demo request before its memory is read.
 """
 
-import re
-import subprocess
-import sys
 import tempfile
-import time
 from pathlib import Path
 from statistics import median
 from typing import Annotated, NamedTuple
@@ -19,8 +15,7 @@ from rich.console import Console
 
 from cab_forecast import Client
 from cab_forecast.demo import demo_request
-
-_ADDRESS = re.compile(r"ready .*grpc=(\S+)")
+from loadtest.servers import random_checkpoint, serving
 
 
 class Start(NamedTuple):
@@ -34,38 +29,10 @@ class Start(NamedTuple):
 
 def start_once(models: Path) -> Start:
     """Starts a server on free ports, calls it once and ends it."""
-    program = str(Path(sys.executable).with_name("cab-forecast"))
-    ports = ["--http", "127.0.0.1:0", "--grpc", "127.0.0.1:0"]
-    command = [program, "serve", "--models", str(models), *ports]
-    begin = time.perf_counter()
-    process = subprocess.Popen(  # noqa: S603
-        command, stderr=subprocess.STDOUT, stdout=subprocess.PIPE, text=True
-    )
-    try:
-        assert process.stdout is not None  # noqa: S101 (for the type checker: it is a pipe)
-        for line in process.stdout:
-            if found := _ADDRESS.search(re.sub(r"\x1b\[[0-9;]*m", "", line)):
-                seconds = time.perf_counter() - begin
-                break
-        else:
-            raise typer.Exit(process.wait())
-        with Client(f"grpc://{found[1]}") as client:
+    with serving(models) as server:
+        with Client(f"grpc://{server.grpc}") as client:
             client.predict(demo_request())
-        return Start(seconds, psutil.Process(process.pid).memory_info().rss)
-    finally:
-        process.terminate()
-        process.communicate()
-
-
-def random_checkpoint(folder: Path) -> None:
-    """A CAB checkpoint of the full size."""
-    from model.bench import cab_network  # noqa: PLC0415 (torch is slow to import)
-    from model.checkpoint import save_checkpoint  # noqa: PLC0415
-
-    model = cab_network()
-    save_checkpoint(
-        folder / "cab", model.info, model.config, model.networks.state_dict(), "Random weights, to measure."
-    )
+        return Start(server.seconds, psutil.Process(server.process.pid).memory_info().rss)
 
 
 def main(

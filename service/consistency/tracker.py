@@ -61,6 +61,7 @@ class Tracker:
         scene_id: str,
         time: float,
         sightings: Sequence[Sighting],
+        patience: float,
         recall: float | None = None,
         latest: bool = False,
     ) -> Tracked:
@@ -70,6 +71,7 @@ class Tracker:
             scene_id: of the call.
             time: of the call, s.
             sightings: its agents.
+            patience: s that the call has left; what waits for the memory must not cost it its forecasts.
             recall: s of history that are wanted; None: none is.
             latest: whether the consistency at the newest observations is wanted.
         """
@@ -83,7 +85,7 @@ class Tracker:
             recalled = await self._guard.run(
                 "exchange",
                 lambda: self._store.exchange(scene_id, time, sightings, recall),
-                self._budget,
+                min(self._budget, max(patience, 0.0)),
                 late=take_late,
             )
         except StoreError:

@@ -44,6 +44,8 @@ _log = structlog.get_logger(__name__)
 
 _T = TypeVar("_T")
 _MAX_WORKERS = 8
+_RESERVE = 0.005
+"""s before a call's deadline at which it no longer waits for the track memory."""
 
 
 class Phase(StrEnum):
@@ -62,6 +64,10 @@ class Call:
     """On the event loop's clock, s; the client's or the server's own, whichever is earlier."""
     catalog: Catalog
     """The models that there are for it."""
+
+    def left(self) -> float:
+        """s until the deadline; negative after it."""
+        return self.deadline - asyncio.get_running_loop().time()
 
     @asynccontextmanager
     async def in_time(self) -> AsyncIterator[None]:
@@ -235,7 +241,7 @@ class DataPlane:
         agents: Agents | None = None
         with self._batcher.admit(options.predicted, accepted) as admission:
             if options.recalls:
-                agents, before = await self._recall(request, options, forecaster, catalog)
+                agents, before = await self._recall(request, options, forecaster, call)
             plan = await self._in_thread(
                 make_plan, request, options, forecaster, catalog, self._settings, agents
             )
@@ -249,7 +255,7 @@ class DataPlane:
         else:
             brought = sightings(plan, results)
             # The memory's answer mostly comes while this one is put together
-            response, after = await asyncio.gather(encoding, self._remember(options, brought))
+            response, after = await asyncio.gather(encoding, self._remember(options, brought, call))
             report(response, before, after)
         self._count_agents(plan)
         return response
@@ -264,22 +270,25 @@ class DataPlane:
         return encode(plan, results, outcomes, seed)
 
     async def _recall(
-        self, request: pb.PredictRequest, options: Options, forecaster: Forecaster, catalog: Catalog
+        self, request: pb.PredictRequest, options: Options, forecaster: Forecaster, call: Call
     ) -> tuple[Agents, Tracked]:
         """The agents, with what the memory knows of them."""
         agents = await self._in_thread(read_agents, request, self._settings)
         tracked = await self._tracker.exchange(
             options.scene_id,
             options.time,
-            observed(agents, (forecaster, catalog.fallback)),
-            recall=history_seconds(frames_of(forecaster, catalog)),
+            observed(agents, (forecaster, call.catalog.fallback)),
+            call.left() - _RESERVE,
+            recall=history_seconds(frames_of(forecaster, call.catalog)),
             latest=options.consistency,
         )
         return with_histories(agents, tracked.histories), tracked
 
-    async def _remember(self, options: Options, brought: Sequence[Sighting]) -> Tracked:
+    async def _remember(self, options: Options, brought: Sequence[Sighting], call: Call) -> Tracked:
         latest = options.consistency and not options.recalls
-        return await self._tracker.exchange(options.scene_id, options.time, brought, latest=latest)
+        return await self._tracker.exchange(
+            options.scene_id, options.time, brought, call.left() - _RESERVE, latest=latest
+        )
 
     async def _forecast(
         self, plan: Plan, deadline: float, admission: Admission

@@ -50,6 +50,8 @@ class _Scene:
         """Calls that have it or wait for it."""
         self.used = 0.0
         """When, on the clock, s."""
+        self.agents = 0
+        """That it had when it was last looked at."""
         self._times: deque[tuple[int, float]] = deque()
         """Number and time of each entry, in order."""
 
@@ -100,6 +102,8 @@ class RedisStore(TrackStore):
         self._now = now
         self._scenes: OrderedDict[str, _Scene] = OrderedDict()
         """The longest unused first."""
+        self._agents = 0
+        """Of all these scenes."""
         self._unanswered: OrderedDict[bytes, None] = OrderedDict()
         """Keys of this server's entries of which it is not known whether they were appended."""
         self._append = Script("append.lua")
@@ -190,17 +194,16 @@ class RedisStore(TrackStore):
         finally:
             scene.users -= 1
             scene.used = self._now()
+            self._agents += len(scene.memory) - scene.agents
+            scene.agents = len(scene.memory)
             self._make_room()
 
     def _make_room(self) -> None:
-        agents = sum(len(scene.memory) for scene in self._scenes.values())
-        for scene_id in list(self._scenes):
-            if agents <= self._max_agents and len(self._scenes) <= self._max_agents:
+        while self._agents > self._max_agents or len(self._scenes) > self._max_agents:
+            unused = next((name for name, scene in self._scenes.items() if not scene.users), None)
+            if unused is None:
                 return
-            scene = self._scenes[scene_id]
-            if not scene.users:
-                agents -= len(scene.memory)
-                del self._scenes[scene_id]
+            self._agents -= self._scenes.pop(unused).agents
 
     async def _call(
         self, scene_id: str, scene: _Scene, entry: bytes = b"", key: bytes = b""

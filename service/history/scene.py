@@ -11,6 +11,9 @@ from service.history.entry import Entry
 from service.history.store import WINDOW, Fate
 from service.history.track import Instant, Track
 
+MAX_AGENTS = 4096
+"""Of a scene."""
+
 
 @dataclass
 class Outcome:
@@ -32,6 +35,7 @@ class SceneMemory:
         self._tracks: dict[str, Track] = {}
 
     def __len__(self) -> int:
+        """Agents."""
         return len(self._tracks)
 
     @property
@@ -61,6 +65,7 @@ class SceneMemory:
                 track, fate = None, Fate.RESET
             if track is None:
                 track = self._tracks[sighting.agent_id] = Track(sighting.kind)
+                self._make_room()
             outcome.fates.append(fate)
             outcome.instants.extend(track.exchange(sighting, entry.time, self.cut))
             if recall is not None:
@@ -76,3 +81,8 @@ class SceneMemory:
         gone = [agent_id for agent_id, track in self._tracks.items() if track.newest < cut]
         for agent_id in gone:
             del self._tracks[agent_id]
+
+    def _make_room(self) -> None:
+        """Who takes new ids for the same agents all the time must not fill the memory."""
+        if len(self._tracks) > MAX_AGENTS:
+            del self._tracks[next(iter(self._tracks))]  # the one that is known for the longest time

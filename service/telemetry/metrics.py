@@ -15,7 +15,7 @@ from prometheus_client import (
     generate_latest,
 )
 
-from model.forecaster import ModelInfo
+from model.forecaster import ModelInfo, Protocol
 
 _SECONDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 _AGENTS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
@@ -90,12 +90,30 @@ class Metrics:
             ["name", "version", "protocol", "default"],
             registry=self.registry,
         )
+        self.benchmark = Gauge(
+            "forecast_benchmark_displacement_error_meters",
+            "What the benchmark measured of forecast_displacement_error_meters, on average.",
+            ["model", "horizon"],
+            registry=self.registry,
+        )
 
     def set_models(self, infos: list[ModelInfo], default: ModelInfo) -> None:
-        """Says which models are loaded."""
+        """Says which models are loaded, and what the benchmark measured of them.
+
+        Args:
+            infos: all, of one name the oldest first.
+            default: one of them.
+        """
         for info in infos:
             is_default = "true" if info == default else "false"
             self.model_info.labels(info.name, info.version, info.protocol.value, is_default).set(1)
+            # A series that began with its first event would hide it: nothing has increased since
+            self.nonfinite.labels(info.name)
+        for info in _by_name(infos, default).values():
+            for seconds in range(1, int(info.horizon) + 1):
+                error_m = info.benchmark.get(f"fde_ml_{seconds}s_m")
+                if error_m is not None:
+                    self.benchmark.labels(info.name, f"{seconds}").set(error_m)
 
     @contextmanager
     def call(self, transport: str, method: str, timed: bool = True) -> Iterator["Call"]:
@@ -118,6 +136,13 @@ class Metrics:
     def render(self) -> bytes:
         """The text that Prometheus reads."""
         return generate_latest(self.registry)
+
+
+def _by_name(infos: list[ModelInfo], default: ModelInfo) -> dict[str, ModelInfo]:
+    """Of each name the version that is meant where none is given: the default, or the newest causal one, or
+    the newest."""
+    causal_last = sorted(infos, key=lambda info: info.protocol is Protocol.CAUSAL)
+    return {info.name: info for info in [*causal_last, default]}
 
 
 class Call:

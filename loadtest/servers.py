@@ -1,0 +1,93 @@
+"""Servers of one's own to measure: each a process on free ports, ended at the end."""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+_START_SECONDS = 120.0
+_STOP_SECONDS = 30.0
+_SETTING = "FORECAST_"
+
+
+@dataclass(frozen=True)
+class Server:
+    """A ``cab-forecast serve`` that is ready."""
+
+    http: str
+    """HOST:PORT of REST."""
+    grpc: str
+    """HOST:PORT of gRPC."""
+    seconds: float
+    """From the process's start to its being ready."""
+    process: "subprocess.Popen[bytes]"
+    log: Path
+
+    def errors(self) -> list[str]:
+        """What it has logged as an error."""
+        return [event["event"] for event in _events(self.log) if event["level"] in ("error", "critical")]
+
+
+@contextmanager
+def serving(models: Path, **settings: object) -> Iterator[Server]:
+    """A server; nothing of this process's own settings goes to it.
+
+    Args:
+        models: folder of its checkpoints; an empty one leaves the baselines.
+        settings: of ``service.settings.Settings``.
+
+    Raises:
+        RuntimeError: it did not start.
+    """
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(_SETTING)}
+    environment |= {_SETTING + name.upper(): str(value) for name, value in settings.items()}
+    ports = ["--http", "127.0.0.1:0", "--grpc", "127.0.0.1:0"]
+    command = [sys.executable, "-m", "service", "serve", "--models", str(models), "--log-json", *ports]
+    with tempfile.TemporaryDirectory(prefix="loadtest-") as folder:
+        log = Path(folder) / "log"
+        with log.open("wb") as output:  # a file, as a pipe that nobody reads fills up
+            begin = time.perf_counter()
+            process = subprocess.Popen(command, env=environment, stderr=subprocess.STDOUT, stdout=output)  # noqa: S603
+        try:
+            ready = _until_ready(process, log, begin + _START_SECONDS)
+            yield Server(ready["http"], ready["grpc"], time.perf_counter() - begin, process, log)
+        finally:
+            process.terminate()
+            try:
+                process.wait(_STOP_SECONDS)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+def random_checkpoint(folder: Path) -> None:
+    """A CAB checkpoint of the full size."""
+    from model.bench import cab_network  # noqa: PLC0415 (torch is slow to import)
+    from model.checkpoint import save_checkpoint  # noqa: PLC0415
+
+    model = cab_network()
+    save_checkpoint(
+        folder / "cab", model.info, model.config, model.networks.state_dict(), "Random weights, to measure."
+    )
+
+
+def _until_ready(process: "subprocess.Popen[bytes]", log: Path, give_up: float) -> dict[str, str]:
+    """What the server says when it is ready."""
+    while process.poll() is None and time.perf_counter() < give_up:
+        for event in _events(log):
+            if event["event"] == "ready":
+                return event
+        time.sleep(0.002)
+    raise RuntimeError(f"the server did not start: {log.read_text()}")
+
+
+def _events(log: Path) -> list[dict[str, str]]:
+    """What is in a log, but for a line that is not whole yet and what other libraries write."""
+    lines = log.read_text().splitlines(keepends=True)
+    return [json.loads(line) for line in lines if line.startswith("{") and line.endswith("\n")]
