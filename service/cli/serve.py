@@ -1,6 +1,7 @@
 """``cab-forecast serve``."""
 
 import asyncio
+import gc
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -85,13 +86,21 @@ def _serve(settings: "Settings", demo: bool) -> None:
 
     async def main() -> None:
         server = Server(settings)
-        await server.run(_show_demo if demo else None)
+        await server.run(lambda started: _when_ready(started, demo))
 
     try:
         with asyncio.Runner(loop_factory=_loop_factory()) as runner:
             runner.run(main())
     except StartError as error:
         fail(str(error))
+
+
+def _when_ready(server: "Server", demo: bool) -> None:
+    # What is there now stays: to look through it again and again for garbage would cost calls their time
+    gc.collect()
+    gc.freeze()
+    if demo:
+        _show_demo(server)
 
 
 def _loop_factory() -> "type[asyncio.AbstractEventLoop] | None":

@@ -1,6 +1,7 @@
 """What a set of forecasts for one instant tells (Ben-Younes et al. 2022, section 4), by ``model.metrics``."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -38,7 +39,16 @@ class Figures:
     """[P, A], whether none of the five likeliest modes was nearer to the observation than the likeliest."""
 
     def __len__(self) -> int:
+        """P."""
         return len(self.time)
+
+    def rows(self, rows: Sequence[int]) -> "Figures":
+        """Some of the instants."""
+        index = np.array(rows, dtype=np.int64)
+        std_m, mean_m, rms_m, known = self.dispersion
+        apart = Dispersion(std_m[index], mean_m[index], rms_m[index], known[index])
+        others = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "dispersion"}
+        return Figures(dispersion=apart, **others)
 
 
 def figures(packed: bytes) -> Figures:
@@ -82,6 +92,8 @@ def _at_the_instant(time: Floats, made_at: Floats, points: Floats, others: Float
     """
     late = (time[:, None] - made_at - AGES_S) / STEP_SECONDS  # steps, mostly 0
     weight = np.where(np.abs(late) <= TIME_TOLERANCE / STEP_SECONDS, 0.0, late)
+    if not np.nan_to_num(weight).any():  # as of frames that come at a steady rate
+        return points[:, :, 1], others[:, :, 1].astype(np.float64)
 
     def read(values: Floats) -> Floats:
         w = weight.reshape(weight.shape + (1,) * (values.ndim - 3))

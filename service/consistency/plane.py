@@ -28,7 +28,7 @@ class ConsistencyPlane:
     Args:
         store: the memory.
         guard: of the calls to it.
-        sums: over the process's life.
+        sums: gives those over the process's life.
         reference_of: a series' model.
         require_ready: raises ``Unavailable`` while calls are not taken.
     """
@@ -37,7 +37,7 @@ class ConsistencyPlane:
         self,
         store: TrackStore,
         guard: Guard,
-        sums: Sums,
+        sums: Callable[[], Sums],
         reference_of: ReferenceOf,
         require_ready: Callable[[], object],
     ) -> None:
@@ -64,7 +64,7 @@ class ConsistencyPlane:
         if not 0 <= request.window <= WINDOW:
             raise BadField("window", f"must be within 0 … {WINDOW:g} s")
         held = await self._read(request.scene_id, request.agent_id)
-        found = figures(held.instants.packed)
+        found = await asyncio.to_thread(figures, held.instants.packed)
         if not len(found):
             return pb.GetAgentConsistencyResponse()
         since = found.time.max() - (request.window or DEFAULT_WINDOW)
@@ -76,7 +76,7 @@ class ConsistencyPlane:
         self._require_ready()
         _check_id("scene_id", request.scene_id)
         held = await self._read(request.scene_id, None)
-        found = figures(held.instants.packed)
+        found = await asyncio.to_thread(figures, held.instants.packed)
         newest: dict[tuple[str, str], int] = {}
         for row, key in enumerate(zip(held.instants.agent_ids, held.instants.series, strict=True)):
             newest[key] = row  # by ascending time: the last one stays
@@ -94,7 +94,7 @@ class ConsistencyPlane:
             Unavailable: not ready.
         """
         self._require_ready()
-        return pb.ListModelConsistencyResponse(models=model_messages(self._sums, self._reference_of))
+        return pb.ListModelConsistencyResponse(models=model_messages(self._sums(), self._reference_of))
 
     async def reset_scene(self, request: pb.ResetSceneRequest) -> pb.ResetSceneResponse:
         """Forgets a scene.
@@ -161,8 +161,9 @@ class ConsistencyPlane:
         return held
 
     def _messages(self, found: Figures, held: Remembered, rows: Sequence[int]) -> list[pb.InstantConsistency]:
-        messages = instant_messages(found, held.instants.agent_ids, held.instants.series, self._reference_of)
-        return [messages[row] for row in rows]
+        of = held.instants
+        ids, series = [of.agent_ids[row] for row in rows], [of.series[row] for row in rows]
+        return instant_messages(found.rows(rows), ids, series, self._reference_of)
 
 
 def _check_id(field: str, value: str) -> None:

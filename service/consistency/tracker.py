@@ -15,6 +15,8 @@ from service.history.store import Recalled, Sighting, StoreError, TrackStore
 
 PATIENCE = 2.0
 """s that those who do not forecast wait for the track memory."""
+_ASIDE = 0.002
+"""s after which what calls settled is counted."""
 
 
 @dataclass
@@ -49,12 +51,19 @@ class Tracker:
         budget: float,
         reference_of: ReferenceOf,
     ) -> None:
-        self.sums = Sums()
+        self._sums = Sums()
         self._store = store
         self._guard = guard
         self._budget = budget
         self._reference_of = reference_of
         self._telling: set[asyncio.Task[None]] = set()
+        self._due: list[tuple[str, Recalled]] = []
+        """What is still to be counted."""
+
+    def sums(self) -> Sums:
+        """What was settled over the process's life, by model."""
+        self._count()
+        return self._sums
 
     async def exchange(
         self,
@@ -78,27 +87,40 @@ class Tracker:
         started = perf_counter()
         tracked = Tracked()
 
-        def take_late(recalled: Recalled) -> None:
-            self._take(scene_id, recalled, latest=False)
-
         try:
             recalled = await self._guard.run(
                 "exchange",
                 lambda: self._store.exchange(scene_id, time, sightings, recall),
                 min(self._budget, max(patience, 0.0)),
-                late=take_late,
+                late=lambda recalled: self._put_off(scene_id, recalled),
             )
         except StoreError:
             tracked.seconds = perf_counter() - started
             return tracked
-        messages = self._take(scene_id, recalled, latest)
         tracked.status = OF_SCENE[recalled.event]
         ids = [one.agent_id for one in sightings]
         tracked.agents = {one: OF_AGENT[fate] for one, fate in zip(ids, recalled.fates, strict=True)}
         tracked.histories = dict(zip(ids, recalled.histories, strict=False))
-        tracked.latest = _newest(sightings, recalled.instants.series, messages) if latest else {}
+        if latest:
+            messages = self._take(scene_id, recalled, latest)
+            tracked.latest = _newest(sightings, recalled.instants.series, messages)
+        else:
+            self._put_off(scene_id, recalled)
         tracked.seconds = perf_counter() - started
         return tracked
+
+    def _put_off(self, scene_id: str, recalled: Recalled) -> None:
+        """Has it counted when the answer is out, which need not wait for it."""
+        if not recalled.instants.series:
+            return
+        if not self._due:
+            asyncio.get_running_loop().call_later(_ASIDE, self._count)
+        self._due.append((scene_id, recalled))
+
+    def _count(self) -> None:
+        due, self._due = self._due, []
+        for scene_id, recalled in due:
+            self._take(scene_id, recalled, latest=False)
 
     def _take(self, scene_id: str, recalled: Recalled, latest: bool) -> list[pb.InstantConsistency]:
         """Counts what was settled and tells those who watch; messages of all instants, if they are wanted."""
@@ -107,7 +129,7 @@ class Tracker:
             return []
         found = figures(instants.packed)
         if found.newly.any():
-            self.sums.add(found, instants.series, newly_only=True)
+            self._sums.add(found, instants.series, newly_only=True)
         if not (latest or recalled.watched):
             return []
         messages = instant_messages(found, instants.agent_ids, instants.series, self._reference_of)

@@ -14,7 +14,8 @@ local needed, expiry, most = tonumber(ARGV[5]), ARGV[6], tonumber(ARGV[7])
 local got = redis.pcall('HMGET', KEYS[1], 'f', 'l', 'k' .. known)
 local first, last = tonumber(not got.err and got[1] or nil), tonumber(not got.err and got[2] or nil)
 if not first or not last or first < 1 or last < first or last - first > 2 * most then  -- none, or none of ours
-  redis.call('DEL', KEYS[1])
+  -- Only if there is something: a script that has deleted is let past the limit of Redis' memory
+  if got.err or redis.call('EXISTS', KEYS[1]) == 1 then redis.call('DEL', KEYS[1]) end
   first, last = 1, 0
 end
 local continues = known > 0 and known <= last and got[3] == key

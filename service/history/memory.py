@@ -52,7 +52,7 @@ class MemoryStore(TrackStore):
         self._forget_the_expired()
         if scene_id not in self._scenes:
             return Remembered((), bundle(()))
-        ids, instants = self._scenes[scene_id][0].everything(agent_id)
+        ids, instants = await self._scenes[scene_id][0].everything(agent_id)
         return Remembered(ids, bundle(instants))
 
     async def reset(self, scene_id: str) -> int:

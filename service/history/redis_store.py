@@ -132,7 +132,7 @@ class RedisStore(TrackStore):
     async def read(self, scene_id: str, agent_id: str | None = None) -> Remembered:
         async with self._at_hand(scene_id) as scene:
             await self._call(scene_id, scene)
-            ids, instants = scene.memory.everything(agent_id)
+            ids, instants = await scene.memory.everything(agent_id)
         return Remembered(ids, bundle(instants))
 
     async def reset(self, scene_id: str) -> int:
@@ -225,6 +225,8 @@ class RedisStore(TrackStore):
         missed: list[Instant] = []
         for number, packed in enumerate(entries, start=last - len(entries) + 1):
             missed.extend(self._read(scene, number, packed))
+            if len(entries) > 1:
+                await asyncio.sleep(0)  # a log of seconds takes a while, and other calls wait
         scene.last = last + 1 if entry else last
         scene.key = key if entry else entries[-1][:_KEY_BYTES] if entries else scene.key
         return bool(continues), bool(watched), missed

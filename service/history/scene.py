@@ -4,10 +4,12 @@ It depends on nothing but these calls and their order. So the memory in this pro
 where the calls are written down in one order for all servers, are the same.
 """
 
+import asyncio
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from service.history.entry import Entry
+from service.history.sighted import Sighted
 from service.history.store import WINDOW, Fate
 from service.history.track import Instant, Track
 
@@ -60,22 +62,33 @@ class SceneMemory:
         self._forget(self.cut)
         for sighting in entry.sightings:
             track = self._tracks.get(sighting.agent_id)
+            given = Sighted.parse(sighting.observations)
             fate = Fate.RESET if sighting.agent_id in gone else Fate.NEW if track is None else Fate.KEPT
-            if track is not None and not track.fits(sighting):
+            if track is not None and not track.fits(sighting.kind, given):
                 track, fate = None, Fate.RESET
             if track is None:
                 track = self._tracks[sighting.agent_id] = Track(sighting.kind)
                 self._make_room()
             outcome.fates.append(fate)
-            outcome.instants.extend(track.exchange(sighting, entry.time, self.cut))
+            outcome.instants.extend(track.exchange(sighting, given, entry.time, self.cut))
             if recall is not None:
                 outcome.histories.append(track.history(entry.time, recall))
         return outcome
 
-    def everything(self, agent_id: str | None = None) -> tuple[list[str], list[Instant]]:
-        """Ids of all agents, or of one if it is remembered, and every observation's set of every series."""
-        ids = list(self._tracks) if agent_id is None else [one for one in (agent_id,) if one in self._tracks]
-        return ids, [instant for one in ids for instant in self._tracks[one].everything(one)]
+    async def everything(self, agent_id: str | None = None) -> tuple[list[str], list[Instant]]:
+        """Ids of all agents, or of one if it is remembered, and every observation's set of every series.
+
+        Each agent is as it is at one time; between them others get their turn, for there may be many.
+        """
+        ids: list[str] = []
+        instants: list[Instant] = []
+        for one in list(self._tracks) if agent_id is None else [agent_id]:
+            track = self._tracks.get(one)
+            if track is not None:
+                ids.append(one)
+                instants.extend(track.everything(one))
+                await asyncio.sleep(0)
+        return ids, instants
 
     def _forget(self, cut: float) -> None:
         gone = [agent_id for agent_id, track in self._tracks.items() if track.newest < cut]

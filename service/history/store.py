@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import AsyncGenerator, Sequence
 from dataclasses import dataclass
 from enum import Enum, IntEnum
+from typing import NamedTuple
 
 WINDOW = 9.0
 """s before a scene's newest call that are remembered: 6 s of forecasts, 2 s for calls that come late, and
@@ -33,8 +34,7 @@ class Fate(IntEnum):
     """It did not fit and was forgotten; what the call brings is its beginning."""
 
 
-@dataclass(frozen=True)
-class Sighting:
+class Sighting(NamedTuple):
     """What one call brings of one agent."""
 
     agent_id: str

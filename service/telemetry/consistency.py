@@ -1,6 +1,6 @@
 """Prometheus series of the track memory and of what it tells."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from prometheus_client import CollectorRegistry, Counter, Histogram
@@ -53,10 +53,10 @@ class ConsistencyCollector(Collector):
     each call would take longer than to find them.
 
     Args:
-        sums: of the settled sets.
+        sums: gives those of the settled sets.
     """
 
-    def __init__(self, sums: Sums) -> None:
+    def __init__(self, sums: Callable[[], Sums]) -> None:
         self._sums = sums
 
     def collect(self) -> Iterable[Metric]:
@@ -77,7 +77,7 @@ class ConsistencyCollector(Collector):
             labels=["model", "horizon"],
         )
         by_name: dict[str, list[ModelSums]] = {}
-        for series, sums in self._sums.models.items():
+        for series, sums in self._sums().models.items():
             by_name.setdefault(series.partition("@")[0], []).append(sums)
         for name, parts in sorted(by_name.items()):
             _add(apart, [name], parts, DISPERSIONS[0], _METERS)

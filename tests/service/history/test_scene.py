@@ -111,13 +111,13 @@ def test_forecasts_off_their_lags_settle_two_seconds_later() -> None:
         assert newest["flags"] == (COMPLETE if number >= 12 else 0)
 
 
-def test_the_nearest_forecast_is_taken_and_none_beyond_the_tolerance() -> None:
+async def test_the_nearest_forecast_is_taken_and_none_beyond_the_tolerance() -> None:
     scene = SceneMemory()
     moments = list(times(13))
     for moment in moments[:12]:
         replay(scene, [moment - 0.08, moment + 0.04])
     replay(scene, [moments[12], moments[12] + SETTLE_AFTER])
-    _, instants = scene.everything()
+    _, instants = await scene.everything()
     rows = unpack_instants(bundle(instants).packed)
     (row,) = rows[rows["time"] == moments[12]]
     assert np.allclose(row["made_at"], np.array(moments[11::-1]) + 0.04, rtol=0, atol=1e-6)
@@ -206,12 +206,12 @@ def test_a_clock_that_jumps_back_begins_anew() -> None:
     assert [time for _, _, time in settled(outcomes)] == [back[-1]]
 
 
-def test_what_is_older_than_the_window_is_forgotten() -> None:
+async def test_what_is_older_than_the_window_is_forgotten() -> None:
     scene = SceneMemory()
     replay(scene, list(times(12)))
     far = START + 5.5 + WINDOW + 0.1
     scene.apply(Entry(far, [sighting(far, "b")]))
-    assert scene.everything()[0] == ["b"]
+    assert (await scene.everything())[0] == ["b"]
     (outcome,) = replay(scene, [far])
     assert outcome.fates == [Fate.NEW]
 
@@ -223,8 +223,8 @@ def test_memory_is_bounded() -> None:
     track = scene._tracks["a"]
     assert len(track._series) == MAX_SERIES
     assert all(len(series.times) <= MAX_FORECASTS for series in track._series.values())
-    assert all(series.times == sorted(series.forecasts) for series in track._series.values())
-    assert len(track._observations) <= WINDOW / 0.01 + 1
+    assert all(series.times == sorted(series._forecasts) for series in track._series.values())
+    assert len(track._seen) <= WINDOW / 0.01 + 1
 
 
 def test_histories_are_what_was_seen_up_to_the_call() -> None:

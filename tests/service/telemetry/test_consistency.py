@@ -12,7 +12,7 @@ from tests.service.consistency.test_figures import instants
 
 def test_histograms_of_what_was_settled() -> None:
     made, sums, registry = instants(100), Sums(), CollectorRegistry()
-    registry.register(ConsistencyCollector(sums))
+    registry.register(ConsistencyCollector(lambda: sums))
     assert b"_bucket" not in generate_latest(registry)
     found = figures(made.tobytes())
     sums.add(found, ["cab@1.0.0"] * 60 + ["cab@1.1.0"] * 40, newly_only=True)
