@@ -4,6 +4,7 @@ import asyncio
 import os
 import secrets
 import time
+from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, contextmanager, suppress
@@ -326,9 +327,9 @@ class DataPlane:
 
     def _count_agents(self, plan: Plan) -> None:
         name = plan.forecaster.info.name
-        for draft in plan.drafts:
-            status = pb.ForecastStatus.Name(draft.status).removeprefix("FORECAST_STATUS_").lower()
-            self._metrics.agents.labels(name, status).inc()
+        for status, count in Counter(draft.status for draft in plan.drafts).items():
+            text = pb.ForecastStatus.Name(status).removeprefix("FORECAST_STATUS_").lower()
+            self._metrics.agents.labels(name, text).inc(count)
 
     def _reference_of(self, series: str) -> models_pb.ModelReference:
         """The model that name@version names; it may be loaded on another server only."""

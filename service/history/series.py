@@ -40,9 +40,9 @@ class Series:
     def __init__(self) -> None:
         self.times: list[float] = []
         """s, ascending."""
-        self.settled: set[float] = set()
         self.pending: list[float] = []
         """Instants whose set is complete but not settled yet, ascending."""
+        self._settled: list[float] = []
         # Nothing in here is looked through by the garbage collector: there may be a million of them
         self._forecasts: dict[float, bytes] = {}
 
@@ -68,8 +68,13 @@ class Series:
         for made in times[:drop]:
             del self._forecasts[made]
         del times[:drop]
-        self.settled = {instant for instant in self.settled if instant >= cut}
-        self.pending = [instant for instant in self.pending if instant >= cut]
+        for instants in (self._settled, self.pending):
+            del instants[: bisect_left(instants, cut)]
+
+    def is_settled(self, instant: float) -> bool:
+        """Whether a set is final."""
+        at = bisect_left(self._settled, instant)
+        return at < len(self._settled) and self._settled[at] == instant
 
     def wait(self, instant: float) -> None:
         """Notes a complete set that is not settled yet."""
@@ -78,7 +83,7 @@ class Series:
 
     def settle(self, instant: float) -> None:
         """Notes a set that is final."""
-        self.settled.add(instant)
+        insort(self._settled, instant)
         if instant in self.pending:
             self.pending.remove(instant)
 

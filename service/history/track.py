@@ -114,7 +114,7 @@ class Track:
         for at, instant in enumerate(self._seen.times):
             for name, series in self._series.items():
                 found = series.gather(instant)
-                flags = COMPLETE * found.complete + SETTLED * (instant in series.settled)
+                flags = COMPLETE * found.complete + SETTLED * series.is_settled(instant)
                 yield self._instant(agent_id, name, at, found, flags)
 
     def _after(self, made: float) -> Iterator[int]:
@@ -132,7 +132,7 @@ class Track:
     ) -> None:
         """One observation's set: settles it if it can be; tells of it then, or if it is asked for."""
         instant = self._seen.times[at]
-        settled = instant in series.settled
+        settled = series.is_settled(instant)
         if not asked and (settled or not series.may_be_complete(instant)):
             return
         found = series.gather(instant)
