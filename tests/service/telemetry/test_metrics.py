@@ -4,7 +4,10 @@ import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from model import kalman
+from model.forecaster import ModelInfo, Protocol
 from service.server import Server
+from service.telemetry.metrics import Metrics
 from tests.service.fakes import FakeForecaster
 from tests.service.requests import CYCLIST, add_agent, make_request
 from tests.service.servers import CallError, call_grpc, call_rest, running
@@ -64,3 +67,37 @@ async def test_servers_do_not_share_metrics() -> None:
         name, labels = "forecast_requests_total", {"transport": "grpc", "method": "Predict", "code": "OK"}
         assert one.metrics.registry.get_sample_value(name, labels) == 1
         assert other.metrics.registry.get_sample_value(name, labels) is None
+
+
+def test_the_benchmark_is_of_the_version_that_a_name_means() -> None:
+    metrics = Metrics()
+
+    def info(name: str, version: str, error_m: float, protocol: Protocol = Protocol.CAUSAL) -> ModelInfo:
+        made = FakeForecaster(name, version=version, protocol=protocol).info
+        return made.model_copy(update={"benchmark": {"fde_ml_1s_m": 0.5, "fde_ml_6s_m": error_m, "nll": 9.0}})
+
+    default = info("cab", "1.0.0", 9.0)
+    metrics.set_models(
+        [
+            default,
+            info("cab", "1.1.0", 8.0),
+            info("rubiz", "1.0.0", 12.0),
+            info("rubiz", "1.1.0", 11.0),
+            info("rubiz", "1.2.0", 7.0, Protocol.PAPER),
+            info("reweight", "1.0.0", 6.0, Protocol.PAPER),
+            kalman.Kalman().info,
+        ],
+        default,
+    )
+    families = text_string_to_metric_families(metrics.render().decode())
+    [gauge] = [f for f in families if f.name == "forecast_benchmark_displacement_error_meters"]
+    seen = {(sample.labels["model"], sample.labels["horizon"]): sample.value for sample in gauge.samples}
+    names = {"cab": 9.0, "rubiz": 11.0, "reweight": 6.0}
+    assert seen == {(name, "6"): m for name, m in names.items()} | {(name, "1"): 0.5 for name in names}
+
+
+def test_what_never_happened_is_counted_as_0() -> None:
+    metrics = Metrics()
+    fake = FakeForecaster().info
+    metrics.set_models([fake], fake)
+    assert metrics.registry.get_sample_value("forecast_nonfinite_total", {"model": "fake"}) == 0
