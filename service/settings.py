@@ -43,10 +43,10 @@ class Settings(BaseSettings):
     store_timeout_ms: float = Field(default=500.0, gt=0)
     """ms after which Redis is taken not to answer at all."""
     store_connections: int = Field(default=16, ge=1)
-    """Connections to each Redis server at most."""
+    """Connections to each Redis server for calls, at most; those who watch have their own."""
     track_expiry: float = Field(default=30.0, ge=10.0)
     """s without a call of a scene after which it is forgotten."""
-    max_tracked_agents: int = Field(default=20_000, ge=1)
+    max_tracked_agents: int = Field(default=5_000, ge=1)
     """Agents that this process has in memory; beyond it the scenes without a call for the longest time go.
     With Redis they are read again when they are called for."""
     models: Path | None = None

@@ -3,8 +3,6 @@
 import asyncio
 from collections.abc import AsyncIterator, Callable, Sequence
 
-import numpy as np
-
 from cab.forecast.v1 import consistency_service_pb2 as pb
 from service.consistency.figures import Figures, figures
 from service.consistency.messages import ReferenceOf, instant_messages, model_messages
@@ -18,6 +16,8 @@ from service.limits import MAX_ID_LENGTH
 
 DEFAULT_WINDOW = 2.0
 """s back from an agent's newest observation."""
+SCENE_WINDOW = 4.0
+"""The same for the sums of a scene: what was not on its lag is settled after 2 s."""
 _WATCH_RETRY = 5.0
 """s until a place among the watchers may be free."""
 
@@ -63,19 +63,15 @@ class ConsistencyPlane:
         _check_id("agent_id", request.agent_id)
         if not 0 <= request.window <= WINDOW:
             raise BadField("window", f"must be within 0 … {WINDOW:g} s")
-        held = await self._read(request.scene_id, request.agent_id)
+        held = await self._read(request.scene_id, request.window or DEFAULT_WINDOW, request.agent_id)
         found = await asyncio.to_thread(figures, held.instants.packed)
-        if not len(found):
-            return pb.GetAgentConsistencyResponse()
-        since = found.time.max() - (request.window or DEFAULT_WINDOW)
-        chosen = np.flatnonzero(found.time >= since).tolist()
-        return pb.GetAgentConsistencyResponse(instants=self._messages(found, held, chosen))
+        return pb.GetAgentConsistencyResponse(instants=self._messages(found, held, range(len(found))))
 
     async def get_scene(self, request: pb.GetSceneConsistencyRequest) -> pb.GetSceneConsistencyResponse:
         """A scene now. Raises as ``get_agent``."""
         self._require_ready()
         _check_id("scene_id", request.scene_id)
-        held = await self._read(request.scene_id, None)
+        held = await self._read(request.scene_id, SCENE_WINDOW)
         found = await asyncio.to_thread(figures, held.instants.packed)
         newest: dict[tuple[str, str], int] = {}
         for row, key in enumerate(zip(held.instants.agent_ids, held.instants.series, strict=True)):
@@ -150,9 +146,11 @@ class ConsistencyPlane:
         """Ends all that watch."""
         self._ended.set()
 
-    async def _read(self, scene_id: str, agent_id: str | None) -> Remembered:
+    async def _read(self, scene_id: str, window: float, agent_id: str | None = None) -> Remembered:
         try:
-            held = await self._guard.run("read", lambda: self._store.read(scene_id, agent_id), PATIENCE)
+            held = await self._guard.run(
+                "read", lambda: self._store.read(scene_id, window, agent_id), PATIENCE
+            )
         except StoreError as error:
             raise TrackingUnavailable(str(error)) from error
         if not held.agent_ids:

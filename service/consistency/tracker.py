@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from time import perf_counter
 
@@ -33,13 +34,19 @@ class Tracked:
     seconds: float = 0.0
     """s that the call waited for it."""
 
+    @property
+    def answered(self) -> bool:
+        """Whether there was an answer in time."""
+        return self.status != pb.TRACKING_STATUS_UNAVAILABLE
+
 
 class Tracker:
     """Remembers what calls bring, and counts what it finds out.
 
     Args:
         store: the memory.
-        guard: of the calls to it.
+        guard: of the calls to it that forecasts wait for.
+        asking: of the others.
         budget: s that a call waits for the memory.
         reference_of: a series' model.
     """
@@ -48,15 +55,18 @@ class Tracker:
         self,
         store: TrackStore,
         guard: Guard,
+        asking: Guard,
         budget: float,
         reference_of: ReferenceOf,
     ) -> None:
         self._sums = Sums()
         self._store = store
         self._guard = guard
+        self._asking = asking
         self._budget = budget
         self._reference_of = reference_of
-        self._telling: set[asyncio.Task[None]] = set()
+        self._telling: dict[str, asyncio.Task[None]] = {}
+        """The last of each scene that is told of something."""
         self._due: list[tuple[str, Recalled]] = []
         """What is still to be counted."""
 
@@ -91,7 +101,8 @@ class Tracker:
             recalled = await self._guard.run(
                 "exchange",
                 lambda: self._store.exchange(scene_id, time, sightings, recall),
-                min(self._budget, max(patience, 0.0)),
+                self._budget,
+                patience_s=max(patience, 0.0),
                 late=lambda recalled: self._put_off(scene_id, recalled),
             )
         except StoreError:
@@ -138,17 +149,22 @@ class Tracker:
         return messages
 
     def _tell(self, scene_id: str, events: Sequence[bytes]) -> None:
-        """Tells those who watch; no call waits for it."""
-        telling = asyncio.create_task(
-            self._guard.run("publish", lambda: self._store.publish(scene_id, events), PATIENCE)
-        )
-        self._telling.add(telling)
-        telling.add_done_callback(self._told)
+        """Tells those who watch, after what they were told before; no call waits for it."""
+        telling = asyncio.create_task(self._publish(scene_id, events, self._telling.get(scene_id)))
+        self._telling[scene_id] = telling
+        telling.add_done_callback(lambda told: self._told(scene_id, told))
 
-    def _told(self, telling: "asyncio.Task[None]") -> None:
-        self._telling.discard(telling)
-        if not telling.cancelled():
-            telling.exception()  # looked at: the guard has counted it
+    async def _publish(
+        self, scene_id: str, events: Sequence[bytes], before: "asyncio.Task[None] | None"
+    ) -> None:
+        if before is not None:
+            await asyncio.wait((before,))
+        with suppress(StoreError):  # the guard has counted it
+            await self._asking.run("publish", lambda: self._store.publish(scene_id, events), PATIENCE)
+
+    def _told(self, scene_id: str, told: "asyncio.Task[None]") -> None:
+        if self._telling.get(scene_id) is told:
+            del self._telling[scene_id]
 
 
 def _newest(

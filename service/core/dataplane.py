@@ -106,10 +106,14 @@ class DataPlane:
         self._store = make_store(settings)
         store_metrics = StoreMetrics(metrics.registry)
         self._guard = Guard(store_metrics.observe, store_metrics.failed)
-        self._tracker = Tracker(self._store, self._guard, settings.store_budget_ms / 1000, self._reference_of)
+        # Of its own: those who ask for much, and wait for it, must not open the circuit of the forecasts
+        self._asking = Guard(store_metrics.observe, store_metrics.failed)
+        self._tracker = Tracker(
+            self._store, self._guard, self._asking, settings.store_budget_ms / 1000, self._reference_of
+        )
         metrics.registry.register(ConsistencyCollector(self._tracker.sums))
         self.consistency = ConsistencyPlane(
-            self._store, self._guard, self._tracker.sums, self._reference_of, self._require_ready
+            self._store, self._asking, self._tracker.sums, self._reference_of, self._require_ready
         )
         """The calls about consistency."""
         self._phase = Phase.STARTING
@@ -132,7 +136,6 @@ class DataPlane:
             SettingsError: a model that is needed is not there.
             Exception: whatever ``load`` raises.
         """
-        await self._store.open()
         models = await self._in_thread(load)
         catalog = build_catalog(models, self._settings.default_model)
         self._batcher.start()
@@ -162,6 +165,7 @@ class DataPlane:
         self.refuse()
         await self._batcher.stop()
         await self._guard.close()
+        await self._asking.close()
         await self._store.close()
         await asyncio.to_thread(self._threads.shutdown, cancel_futures=True)
 
@@ -254,7 +258,8 @@ class DataPlane:
         if not options.scene_id:
             response = await encoding
         else:
-            brought = sightings(plan, results)
+            remembered = before is not None and before.answered
+            brought = sightings(plan, results, remembered)
             # The memory's answer mostly comes while this one is put together
             response, after = await asyncio.gather(encoding, self._remember(options, brought, call))
             report(response, before, after)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import TypeAlias
 
 from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
@@ -12,6 +13,15 @@ from service.core.encode import Result
 from service.core.plan import Plan
 from service.history.records import KINDS, pack_forecasts, pack_observations, unpack_observations
 from service.history.store import Sighting
+
+Status: TypeAlias = "consistency_pb.TrackingStatus.ValueType"
+_SEVERITY = (
+    consistency_pb.TRACKING_STATUS_UNSPECIFIED,
+    consistency_pb.TRACKING_STATUS_OK,
+    consistency_pb.TRACKING_STATUS_NEW,
+    consistency_pb.TRACKING_STATUS_RESET,
+    consistency_pb.TRACKING_STATUS_UNAVAILABLE,
+)
 
 
 def series_of(forecaster: Forecaster) -> str:
@@ -58,13 +68,14 @@ def with_histories(agents: Agents, histories: Mapping[str, bytes]) -> Agents:
     return replace(agents, observations=unpack_observations(packed))
 
 
-def sightings(plan: Plan, results: Sequence[Result]) -> list[Sighting]:
-    """What a call brings: forecasts but for blind ones, and each agent's newest observation, unless it was
-    remembered when histories were recalled.
+def sightings(plan: Plan, results: Sequence[Result], remembered: bool) -> list[Sighting]:
+    """What a call brings: forecasts but for blind ones, and each agent's newest observation, unless it is
+    remembered already.
 
     Args:
         plan: of the call.
         results: the forecasts that were made.
+        remembered: whether the observations were, when histories were recalled.
     """
     agents = plan.agents
     made: dict[int, tuple[str, bytes]] = {}
@@ -79,9 +90,9 @@ def sightings(plan: Plan, results: Sequence[Result]) -> list[Sighting]:
     brought = []
     for index, kind, newest in zip(agents.valid.tolist(), agents.types, packed, strict=True):
         series, forecast = made.get(index, ("", b""))
-        if plan.options.recalls and not forecast:
-            continue  # was remembered before
-        observations = b"" if plan.options.recalls else newest
+        if remembered and not forecast:
+            continue
+        observations = b"" if remembered else newest
         steps = plan.options.steps if forecast else 0
         brought.append(Sighting(agents.ids[index], KINDS[kind], observations, series, forecast, steps))
     return brought
@@ -96,15 +107,22 @@ def report(response: pb.PredictResponse, before: Tracked | None, after: Tracked)
         after: of the time when they were brought.
     """
     first = before or after
-    lost = consistency_pb.TRACKING_STATUS_UNAVAILABLE
-    response.tracking = lost if lost in (first.status, after.status) else first.status
+    response.tracking = max(first.status, after.status, key=_SEVERITY.index)
     response.timing.tracking = after.seconds + (before.seconds if before is not None else 0.0)
     for forecast in response.forecasts:
-        if forecast.status == pb.FORECAST_STATUS_INVALID and forecast.agent_id not in first.agents:
-            continue
-        forecast.tracking = (
-            lost if response.tracking == lost else first.agents.get(forecast.agent_id, first.status)
-        )
-        latest = first.latest.get(forecast.agent_id)
+        agent_id = forecast.agent_id
+        if response.tracking == consistency_pb.TRACKING_STATUS_UNAVAILABLE:
+            forecast.tracking = response.tracking
+        elif agent_id in first.agents:
+            forecast.tracking = _of_agent(first.agents[agent_id], after.agents.get(agent_id))
+        latest = first.latest.get(agent_id)
         if latest is not None and latest.model == forecast.model:
             forecast.consistency.CopyFrom(latest)
+
+
+def _of_agent(first: "Status", after: "Status | None") -> "Status":
+    """What became of an agent, which may have been lost between the two times that a call asked."""
+    gone = (consistency_pb.TRACKING_STATUS_NEW, consistency_pb.TRACKING_STATUS_RESET)
+    if first == consistency_pb.TRACKING_STATUS_OK and after in gone:
+        return consistency_pb.TRACKING_STATUS_RESET
+    return first

@@ -6,13 +6,12 @@ from typing import Any
 
 import msgpack
 
-from service.history.records import FORECAST_BYTES, KINDS, OBSERVATION_BYTES
+from service.history.records import AGES, FORECAST_BYTES, KINDS, OBSERVATION_BYTES
 from service.history.store import Sighting
 
 _VERSION = 1
 """Of this layout. Servers leave out what is of another one."""
 _KINDS = frozenset(KINDS.values())
-_MAX_STEPS = 12
 
 
 class EntryError(ValueError):
@@ -65,7 +64,7 @@ def _sighting(
         and isinstance(forecast, bytes)
         and len(forecast) in (0, FORECAST_BYTES)
         and isinstance(steps, int)
-        and 0 <= steps <= _MAX_STEPS
+        and 0 <= steps <= AGES
     )
     if not fits:
         raise EntryError("of another layout")

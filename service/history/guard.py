@@ -82,6 +82,7 @@ class Guard:
         call: Callable[[], Awaitable[_T]],
         budget_s: float,
         late: Callable[[_T], None] | None = None,
+        patience_s: float | None = None,
     ) -> _T:
         """What a call returns.
 
@@ -90,6 +91,7 @@ class Guard:
             call: makes the call, which ends by itself, be it after this has returned.
             budget_s: s that this waits.
             late: given what the call returns when nobody waits for it any more.
+            patience_s: s that the caller has, if that may be less; that it runs out says nothing of Redis.
 
         Raises:
             StoreError: it failed, took too long or was not made.
@@ -99,14 +101,16 @@ class Guard:
         self._outstanding.add(task)
         task.add_done_callback(self._outstanding.discard)
         attempt = _Attempt(op, self._circuit.begin(), asyncio.get_running_loop().time() + budget_s)
+        hurried = patience_s is not None and patience_s < budget_s
         try:
-            await _wait(task, budget_s)
+            await _wait(task, patience_s if hurried and patience_s is not None else budget_s)
         except asyncio.CancelledError:
             # Nobody is there to be told, but the circuit must hear of it: this may be the call that decides.
             self._abandon(attempt, task, late)
             raise
         if not task.done():
-            self._settle(attempt, Reason.TIMEOUT)
+            if not hurried:
+                self._settle(attempt, Reason.TIMEOUT)
             self._abandon(attempt, task, late)
             raise store_error(Reason.TIMEOUT)
         return self._result(attempt, task)

@@ -38,7 +38,7 @@ class MemoryStore(TrackStore):
         outcome = scene.apply(Entry(time, sightings), recall)
         self._scenes[scene_id] = scene, self._now() + self._expiry
         self._agents += len(scene)
-        while self._agents > self._max_agents and len(self._scenes) > 1:
+        while len(self._scenes) > 1 and max(self._agents, len(self._scenes)) > self._max_agents:
             self._take(next(iter(self._scenes)))
         return Recalled(
             Event.BEGUN if known is None else Event.KEPT,
@@ -48,11 +48,11 @@ class MemoryStore(TrackStore):
             self._fanout.watched(scene_id),
         )
 
-    async def read(self, scene_id: str, agent_id: str | None = None) -> Remembered:
+    async def read(self, scene_id: str, window: float, agent_id: str | None = None) -> Remembered:
         self._forget_the_expired()
         if scene_id not in self._scenes:
             return Remembered((), bundle(()))
-        ids, instants = await self._scenes[scene_id][0].everything(agent_id)
+        ids, instants = await self._scenes[scene_id][0].everything(window, agent_id)
         return Remembered(ids, bundle(instants))
 
     async def reset(self, scene_id: str) -> int:
@@ -65,9 +65,6 @@ class MemoryStore(TrackStore):
 
     def watch(self, scene_id: str) -> AsyncGenerator[tuple[Sequence[bytes], int], None]:
         return self._fanout.watch(scene_id)
-
-    async def open(self) -> None:
-        """Nothing to be done."""
 
     async def close(self) -> None:
         self._fanout.close()

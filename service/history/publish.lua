@@ -1,7 +1,18 @@
 -- Keys: the stream of a scene's events, and how many there were. Arguments: ms that both are kept, how many entries
 -- the stream keeps at least, how many events come, and these in one string.
-local last = redis.call('INCRBY', KEYS[2], ARGV[3])
-redis.call('XADD', KEYS[1], 'MAXLEN', '~', ARGV[2], '*', 'last', last, 'events', ARGV[4])
+local function publish()
+  local last = redis.pcall('INCRBY', KEYS[2], ARGV[3])
+  if type(last) == 'table' then return last end
+  local added = redis.pcall('XADD', KEYS[1], 'MAXLEN', '~', ARGV[2], '*', 'last', last, 'events', ARGV[4])
+  return type(added) == 'table' and added or last
+end
+
+local last = publish()
+if type(last) == 'table' and not string.find(last.err, 'OOM') then  -- something else in their place
+  redis.call('DEL', KEYS[1], KEYS[2])
+  last = publish()
+end
+if type(last) == 'table' then return last end
 redis.call('PEXPIRE', KEYS[1], ARGV[1])
 redis.call('PEXPIRE', KEYS[2], ARGV[1])
 return last

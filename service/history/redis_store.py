@@ -12,10 +12,12 @@ import struct
 import time as clock
 from collections import OrderedDict, deque
 from collections.abc import AsyncGenerator, Callable, Sequence
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from typing import Any
 
 import structlog
+from redis.asyncio import Redis
+from redis.exceptions import ReadOnlyError
 
 from service.history.entry import Entry, EntryError, pack_entry, unpack_entry
 from service.history.failures import reason_of, store_error
@@ -42,6 +44,8 @@ class _Scene:
 
     def __init__(self) -> None:
         self.memory = SceneMemory()
+        self.log = b""
+        """The log's name; empty: none was read."""
         self.last, self.key = 0, b""
         """Number and key of the last entry that was read."""
         self.lock = asyncio.Lock()
@@ -52,6 +56,10 @@ class _Scene:
         """When, on the clock, s."""
         self.agents = 0
         """That it had when it was last looked at."""
+        self.lost = False
+        """Whether the log that was known has gone, and no call was told so yet."""
+        self.missed: list[Instant] = []
+        """What entries of this server led to of which it had got no answer; no call was told of it yet."""
         self._times: deque[tuple[int, float]] = deque()
         """Number and time of each entry, in order."""
 
@@ -62,17 +70,24 @@ class _Scene:
             self._times.popleft()
         return self._times[0][0] if self._times else self.last + 1
 
-    def apply(self, number: int, entry: Entry, recall: float | None = None) -> Outcome:
+    def apply(self, number: int, key: bytes, entry: Entry, recall: float | None = None) -> Outcome:
         """Goes one entry on."""
         outcome = self.memory.apply(entry, recall)
+        if outcome.restarted:  # its clock was ahead: by its time nothing of before would ever be old
+            self._times.clear()
         self._times.append((number, entry.time))
+        self.skip(number, key)
         return outcome
+
+    def skip(self, number: int, key: bytes) -> None:
+        """Goes one entry on that says nothing."""
+        self.last, self.key = number, key
 
     def forget(self) -> None:
         """Begins anew."""
         self.memory = SceneMemory()
         self._times.clear()
-        self.last, self.key = 0, b""
+        self.log, self.last, self.key = b"", 0, b""
 
 
 class RedisStore(TrackStore):
@@ -115,24 +130,24 @@ class RedisStore(TrackStore):
         entry = Entry(time, sightings)
         key = secrets.token_bytes(_KEY_BYTES)
         async with self._at_hand(scene_id) as scene:
-            before = scene.last
             self._unanswered[key] = None
             if len(self._unanswered) > MAX_ENTRIES:
                 self._unanswered.popitem(last=False)
-            continues, watched, missed = await self._call(scene_id, scene, key + pack_entry(entry), key)
+            watched = await self._call(scene_id, scene, key + pack_entry(entry), key)
             del self._unanswered[key]
-            outcome = scene.apply(scene.last, entry, recall)
-        event = Event.KEPT
-        if not continues:
-            event = Event.LOST if before else Event.KEPT if scene.last > 1 else Event.BEGUN
-        return Recalled(
-            event, outcome.fates, outcome.histories, bundle([*missed, *outcome.instants]), watched
-        )
+            begun = scene.last == 0
+            outcome = scene.apply(scene.last + 1, key, entry, recall)
+            event = Event.LOST if scene.lost else Event.BEGUN if begun else Event.KEPT
+            instants = bundle([*scene.missed, *outcome.instants])
+            scene.lost, scene.missed = False, []
+        return Recalled(event, outcome.fates, outcome.histories, instants, watched)
 
-    async def read(self, scene_id: str, agent_id: str | None = None) -> Remembered:
+    async def read(self, scene_id: str, window: float, agent_id: str | None = None) -> Remembered:
         async with self._at_hand(scene_id) as scene:
             await self._call(scene_id, scene)
-            ids, instants = await scene.memory.everything(agent_id)
+            memory = scene.memory
+        # Calls of the scene need not wait for this
+        ids, instants = await memory.everything(window, agent_id)
         return Remembered(ids, bundle(instants))
 
     async def reset(self, scene_id: str) -> int:
@@ -154,14 +169,15 @@ class RedisStore(TrackStore):
 
     async def watch(self, scene_id: str) -> AsyncGenerator[tuple[Sequence[bytes], int], None]:
         keys = SceneKeys(scene_id)
+        renewing: asyncio.Task[None] | None = None
         try:
             entry_id, seen = b"0-0", 0
             for newest, fields in await self._watching.xrevrange(keys.events, count=1):
                 entry_id, seen = newest, int(fields[b"last"])
             await self._watching.set(keys.watched, 1, px=_WATCHED_MS)
+            renewing = asyncio.create_task(self._renew(keys))  # however slowly the events are taken
             yield (), 0
             while True:
-                await self._watching.set(keys.watched, 1, px=_WATCHED_MS)
                 streams = await self._watching.xread({keys.events: entry_id}, block=_BLOCK_MS)
                 for _, entries in streams or ():
                     for newest, fields in entries:
@@ -172,9 +188,16 @@ class RedisStore(TrackStore):
                         yield events, missed
         except Exception as error:
             raise store_error(reason_of(error)) from error
+        finally:
+            if renewing is not None:
+                renewing.cancel()
+                await asyncio.gather(renewing, return_exceptions=True)
 
-    async def open(self) -> None:
-        """Nothing to be done: connections are made when they are needed."""
+    async def _renew(self, keys: SceneKeys) -> None:
+        while True:
+            await asyncio.sleep(_WATCHED_MS / 5000)
+            with suppress(Exception):  # the reader finds out what there is to be told
+                await self._watching.set(keys.watched, 1, px=_WATCHED_MS)
 
     async def close(self) -> None:
         await self._client.aclose()
@@ -205,39 +228,54 @@ class RedisStore(TrackStore):
                 return
             self._agents -= self._scenes.pop(unused).agents
 
-    async def _call(
-        self, scene_id: str, scene: _Scene, entry: bytes = b"", key: bytes = b""
-    ) -> tuple[bool, bool, list[Instant]]:
+    async def _call(self, scene_id: str, scene: _Scene, entry: bytes = b"", key: bytes = b"") -> bool:
         """Appends an entry, if one is given, after all that others appended was read.
 
         Returns:
-            Whether the log was the one that is at hand; whether somebody watches; what entries of this server
-            led to of which it had got no answer.
+            Whether somebody watches.
         """
         keys = SceneKeys(scene_id)
-        last, continues, watched, entries = await self._append.run(
-            self._client,
-            [keys.log, keys.watched],
-            [scene.last, scene.key, entry, key, scene.needed, self._expiry_ms, MAX_ENTRIES],
-        )
+        arguments: list[str | bytes | int] = [
+            scene.log,
+            scene.last,
+            scene.key,
+            entry,
+            key,
+            scene.needed,
+            self._expiry_ms,
+            MAX_ENTRIES,
+        ]
+        try:
+            reply = await self._append.run(self._client, [keys.log, keys.watched], arguments)
+        except ReadOnlyError:
+            # What is behind the address is another server's replica by now: the next call connects anew
+            if isinstance(self._client, Redis):
+                await self._client.connection_pool.disconnect(inuse_connections=False)
+            raise
+        log, last, continues, same, watched, entries = reply
         if not continues:
+            scene.lost = scene.lost or (bool(scene.log) and not same)
             scene.forget()
-        missed: list[Instant] = []
-        for number, packed in enumerate(entries, start=last - len(entries) + 1):
-            missed.extend(self._read(scene, number, packed))
-            if len(entries) > 1:
-                await asyncio.sleep(0)  # a log of seconds takes a while, and other calls wait
-        scene.last = last + 1 if entry else last
-        scene.key = key if entry else entries[-1][:_KEY_BYTES] if entries else scene.key
-        return bool(continues), bool(watched), missed
+        try:
+            for number, packed in enumerate(entries, start=last - len(entries) + 1):
+                scene.missed.extend(self._read(scene, number, packed))
+                if len(entries) > 1:
+                    await asyncio.sleep(0)  # a log of seconds takes a while, and other calls wait
+        except BaseException:
+            scene.forget()  # it is read again: nothing of it may be taken twice
+            raise
+        scene.log = log if entry or last else b""
+        return bool(watched)
 
     def _read(self, scene: _Scene, number: int, packed: bytes) -> list[Instant]:
+        key = packed[:_KEY_BYTES]
         try:
-            outcome = scene.apply(number, unpack_entry(packed[_KEY_BYTES:]))
+            outcome = scene.apply(number, key, unpack_entry(packed[_KEY_BYTES:]))
         except EntryError as error:
             _log.warning("an entry of a scene's log was left out", why=str(error))
+            scene.skip(number, key)
             return []
-        if self._unanswered.pop(packed[:_KEY_BYTES], self) is self:
+        if self._unanswered.pop(key, self) is self:
             return []
         return outcome.instants
 

@@ -8,9 +8,10 @@ import asyncio
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from model.resample import TIME_TOLERANCE
 from service.history.entry import Entry
 from service.history.sighted import Sighted
-from service.history.store import WINDOW, Fate
+from service.history.store import LATENESS, WINDOW, Fate
 from service.history.track import Instant, Track
 
 MAX_AGENTS = 4096
@@ -27,6 +28,8 @@ class Outcome:
     """Of each of its agents, if they were asked for."""
     instants: list[Instant] = field(default_factory=list)
     """What there is to be told."""
+    restarted: bool = False
+    """Whether all that came before was forgotten: its clock was ahead."""
 
 
 class SceneMemory:
@@ -54,7 +57,8 @@ class SceneMemory:
         """
         outcome = Outcome()
         gone: Sequence[str] = ()
-        if entry.time < self.cut:  # its clock jumped back, or it plays again
+        if entry.time < self._newest - LATENESS - TIME_TOLERANCE:
+            outcome.restarted = True
             gone = tuple(self._tracks)
             self._tracks.clear()
             self._newest = entry.time
@@ -75,10 +79,14 @@ class SceneMemory:
                 outcome.histories.append(track.history(entry.time, recall))
         return outcome
 
-    async def everything(self, agent_id: str | None = None) -> tuple[list[str], list[Instant]]:
-        """Ids of all agents, or of one if it is remembered, and every observation's set of every series.
+    async def everything(self, window: float, agent_id: str | None = None) -> tuple[list[str], list[Instant]]:
+        """Ids of all agents, or of one if it is remembered, and each observation's set of every series.
 
         Each agent is as it is at one time; between them others get their turn, for there may be many.
+
+        Args:
+            window: s before an agent's newest observation.
+            agent_id: which; None: all.
         """
         ids: list[str] = []
         instants: list[Instant] = []
@@ -86,7 +94,7 @@ class SceneMemory:
             track = self._tracks.get(one)
             if track is not None:
                 ids.append(one)
-                instants.extend(track.everything(one))
+                instants.extend(track.everything(one, window))
                 await asyncio.sleep(0)
         return ids, instants
 

@@ -6,6 +6,9 @@ from model.observations import JUMP_SLACK, MAX_SPEED
 from model.resample import TIME_TOLERANCE
 from service.history.records import OBSERVATION_BYTES
 
+SAME_PLACE = 0.1
+"""m; two observations of one time that are farther apart contradict each other."""
+
 _PLACE = struct.Struct("<ddd")
 
 
@@ -58,7 +61,10 @@ class Sighted:
             for at in (before, before + 1):
                 if not 0 <= at < len(self.times):
                     continue
-                if abs(place - self._places[at]) > MAX_SPEED * abs(time - self.times[at]) + JUMP_SLACK:
+                apart = abs(time - self.times[at])
+                # Of one time there is one place: a call that comes twice says the same
+                slack = JUMP_SLACK if apart > TIME_TOLERANCE else SAME_PLACE
+                if abs(place - self._places[at]) > MAX_SPEED * apart + slack:
                     return False
         return True
 

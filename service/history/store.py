@@ -6,16 +6,19 @@ from dataclasses import dataclass
 from enum import Enum, IntEnum
 from typing import NamedTuple
 
-WINDOW = 9.0
-"""s before a scene's newest call that are remembered: 6 s of forecasts, 2 s for calls that come late, and
-some room for frames that do not come on time."""
+WINDOW = 10.5
+"""s before a scene's newest call that are remembered: 6.1 s of forecasts, 2 s until a set is settled, 2 s for
+calls that come late, and some room."""
 AGE_TOLERANCE = 0.09
 """s that a forecast may have been made off its lag of k · 0.5 s: at 10 Hz none stands in for a
 lost frame's."""
-SETTLE_AFTER = 2.0
+LATENESS = 2.0
+"""s before a scene's newest call that another may come. An earlier one is of a clock that was put back, or of
+a recording that is played again, and the scene begins anew."""
+SETTLE_AFTER = LATENESS
 """s after which a complete set is final though forecasts in it were made off their lags."""
-MAX_FORECASTS = 128
-"""Forecasts of one model that are remembered of an agent, 16 a second over the window; the oldest go."""
+MAX_FORECASTS = 150
+"""Forecasts of one model that are remembered of an agent, 14 a second over the window; the oldest go."""
 MAX_SERIES = 15
 """Models whose forecasts are remembered of one agent; those of others are not."""
 
@@ -120,8 +123,13 @@ class TrackStore(ABC):
         """
 
     @abstractmethod
-    async def read(self, scene_id: str, agent_id: str | None = None) -> Remembered:
+    async def read(self, scene_id: str, window: float, agent_id: str | None = None) -> Remembered:
         """What is remembered of one agent, or of all.
+
+        Args:
+            scene_id: whose.
+            window: s before an agent's newest observation from which on observations are told.
+            agent_id: which; None: all.
 
         Raises:
             StoreError: there is no answer.
@@ -155,10 +163,6 @@ class TrackStore(ABC):
         Raises:
             StoreError: the store cannot be reached any more.
         """
-
-    @abstractmethod
-    async def open(self) -> None:
-        """Makes ready; a store that cannot be reached yet is no error."""
 
     @abstractmethod
     async def close(self) -> None:

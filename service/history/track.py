@@ -2,6 +2,7 @@
 
 import math
 import struct
+from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -84,10 +85,6 @@ class Track:
             and bool(sighting.forecast)
             and mine.insert(time, sighting.forecast, sighting.steps)
         )
-        self._seen.trim(cut)
-        for series in self._series.values():
-            series.trim(cut)
-
         told: list[Instant] = []
         for when in given.times:
             at = self._seen.last_until(when)
@@ -103,15 +100,21 @@ class Track:
         if fresh and mine is not None:
             for at in self._after(time):
                 self._look(told, sighting.agent_id, sighting.series, mine, at, False)
+        # Last: what is due must be settled by all that was there for it
+        self._seen.trim(cut)
+        for series in self._series.values():
+            series.trim(cut)
         return told
 
     def history(self, time: float, recall: float) -> bytes:
         """Observations up to a time, those of the last ``recall`` seconds, and always the last one."""
         return self._seen.history(time, recall)
 
-    def everything(self, agent_id: str) -> Iterator[Instant]:
-        """Every observation's set of every series, as it is."""
-        for at, instant in enumerate(self._seen.times):
+    def everything(self, agent_id: str, window: float) -> Iterator[Instant]:
+        """Each observation's set of every series, as it is: those of the last ``window`` seconds."""
+        times = self._seen.times
+        for at in range(bisect_left(times, times[-1] - window) if times else 0, len(times)):
+            instant = times[at]
             for name, series in self._series.items():
                 found = series.gather(instant)
                 flags = COMPLETE * found.complete + SETTLED * series.is_settled(instant)

@@ -27,7 +27,7 @@ class StoreMetrics:
     def __init__(self, registry: CollectorRegistry) -> None:
         self._seconds = Histogram(
             "forecast_track_store_seconds",
-            "Calls to the track memory, as long as they were waited for.",
+            "Calls to the track memory, each to its own end.",
             ["op"],
             buckets=_STORE_SECONDS,
             registry=registry,
@@ -40,7 +40,7 @@ class StoreMetrics:
         )
 
     def observe(self, op: str, seconds: float) -> None:
-        """An answer came."""
+        """A call ended."""
         self._seconds.labels(op).observe(seconds)
 
     def failed(self, op: str, reason: str) -> None:

@@ -6,6 +6,9 @@ import sys
 import structlog
 from structlog.typing import Processor
 
+# No values of variables: among them there may be a password, or somebody's request
+_FRAMES = structlog.tracebacks.ExceptionDictTransformer(show_locals=False)
+
 
 def configure(level: str, as_json: bool) -> None:
     """Sets up logging for the whole process.
@@ -21,9 +24,14 @@ def configure(level: str, as_json: bool) -> None:
         structlog.processors.TimeStamper(fmt="iso", utc=True),
     ]
     renderer: list[Processor] = (
-        [structlog.processors.dict_tracebacks, structlog.processors.JSONRenderer()]
+        [structlog.processors.ExceptionRenderer(_FRAMES), structlog.processors.JSONRenderer()]
         if as_json
-        else [structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty())]
+        else [
+            structlog.dev.ConsoleRenderer(
+                colors=sys.stderr.isatty(),
+                exception_formatter=structlog.dev.plain_traceback,
+            )
+        ]
     )
     structlog.configure(
         processors=[

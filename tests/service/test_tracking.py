@@ -11,11 +11,12 @@ import pytest
 
 from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
-from cab_forecast import AsyncClient, BadRequest
+from cab_forecast import AsyncClient, BadRequest, Overloaded, TrackingUnavailable, UnknownTrack
+from service.history.stores import MAX_WATCHERS
 from service.server import Server
 from tests.nuscenes_pred import real_tracks
 from tests.service.fakes import FakeForecaster
-from tests.service.history.redis_servers import single
+from tests.service.history.redis_servers import free_port, single
 from tests.service.history.stores import scene_name
 from tests.service.processes import process, ready
 from tests.service.servers import running
@@ -253,3 +254,51 @@ async def test_two_servers_on_one_redis_one_of_them_killed(redis_url: str) -> No
                 consistency_pb.TRACKING_STATUS_NEW,
                 consistency_pb.TRACKING_STATUS_OK,
             }
+
+
+async def test_forecasts_go_on_without_the_memory() -> None:
+    """Redis is not there: each answer says so, and calls about the memory say what is the matter."""
+    tracks = made_up(scene_name(), agents=2)
+    away = f"redis://127.0.0.1:{free_port()}"
+    async with (
+        running(store=away, default_model=MODEL) as server,
+        AsyncClient(server.grpc_address, timeout=30.0, retries=0) as client,
+    ):
+        replayed = await replay([client], tracks, MODEL, range(1, 8))
+        newest = await replay([client], tracks, MODEL, range(8, 10), newest_only=True)
+        for answer in (*replayed.answers.values(), *newest.answers.values()):
+            assert answer.tracking == consistency_pb.TRACKING_STATUS_UNAVAILABLE
+            assert {one.tracking for one in answer.forecasts} == {answer.tracking}
+        assert (
+            len(replayed.paths) == 7 + 6
+        )  # the second agent comes a second later, its first frame is too little
+        with pytest.raises(TrackingUnavailable, match="the track memory"):
+            await client.scene_consistency(tracks.name)
+        with pytest.raises(TrackingUnavailable):
+            await client.reset_scene(tracks.name)
+        with pytest.raises(TrackingUnavailable):
+            await anext(client.watch_scene(tracks.name))
+        assert await client.model_consistency() == []
+        metrics = server.metrics.render().decode()
+        errors = [line for line in metrics.splitlines() if "track_store_errors_total{" in line]
+        assert any('op="exchange",reason="refused"' in line for line in errors)
+
+
+async def test_no_more_than_so_many_watch(server: Server) -> None:
+    async with AsyncClient(server.grpc_address, timeout=30.0, retries=0) as client, AsyncExitStack() as stack:
+        for _ in range(MAX_WATCHERS):
+            await stack.enter_async_context(client.watch_scene(scene_name()))
+        with pytest.raises(Overloaded, match=f"{MAX_WATCHERS} calls watch already"):
+            async with client.watch_scene(scene_name()):
+                pass
+
+
+async def test_an_agent_that_nothing_was_forecast_for(server: Server) -> None:
+    tracks = made_up(scene_name(), agents=1)
+    request = tracks.request(3, MODEL)
+    request.agents[0].predict = False
+    async with AsyncClient(server.grpc_address, timeout=30.0) as client:
+        await client.predict(request)
+        assert await client.agent_consistency(tracks.name, "agent 0") == []
+        with pytest.raises(UnknownTrack):
+            await client.agent_consistency(tracks.name, "agent 1")

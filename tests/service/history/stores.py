@@ -26,7 +26,6 @@ async def opened(
         expiry,
         max_agents,
     )
-    await store.open()
     try:
         yield store
     finally:

@@ -117,6 +117,24 @@ async def test_over_its_budget_a_call_goes_on_alone(watched: Watched) -> None:
     assert [op for op, _ in watched.times] == ["exchange"]
 
 
+async def test_a_caller_in_a_hurry_blames_nobody(watched: Watched) -> None:
+    may_end = asyncio.Event()
+
+    async def call() -> str:
+        await may_end.wait()
+        return "late"
+
+    late: list[str] = []
+    for _ in range(5):
+        with pytest.raises(StoreError):
+            await watched.guard.run("exchange", call, LONG, late.append, patience_s=SHORT)
+    may_end.set()
+    assert await watched.guard.run("exchange", call, LONG) == "late"  # the circuit is closed
+    await asyncio.sleep(0)
+    assert not watched.failures
+    assert late == ["late"] * 5
+
+
 async def test_a_reply_that_is_there_counts_though_the_loop_was_busy(watched: Watched) -> None:
     async def call() -> str:
         time.sleep(0.05)  # noqa: ASYNC251 - just that is meant

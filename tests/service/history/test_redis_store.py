@@ -67,7 +67,7 @@ async def test_two_servers_in_turn_are_as_one(store: RedisStore, other: RedisSto
     scene = scene_name()
     together = await replay([store, other, other, store, store], scene, moments)
     assert rows(together) == rows(await replay([memory()], scene, moments))
-    assert (await store.read(scene)).instants == (await other.read(scene)).instants
+    assert (await store.read(scene, 99.0)).instants == (await other.read(scene, 99.0)).instants
 
 
 async def test_a_server_that_starts_midway_knows_all(store: RedisStore, redis_server: Process) -> None:
@@ -107,7 +107,7 @@ async def test_whatever_comes_both_memories_say_the_same(
         answer = await (store, other)[server].exchange(scene, t, brought, recall=3.0)
         assert (answer.fates, answer.histories) == (expected.fates, expected.histories)
         assert answer.instants == expected.instants
-    assert (await other.read(scene)).instants == (await alone.read(scene)).instants
+    assert (await other.read(scene, 99.0)).instants == (await alone.read(scene, 99.0)).instants
 
 
 async def test_one_round_trip_a_call(redis_server: Process, store: RedisStore) -> None:
@@ -166,7 +166,7 @@ async def test_a_log_that_lost_its_end(redis_server: Process, store: RedisStore,
     await replay([other], scene, times(17)[15:16])  # and 12
     (answer,) = await replay([store], scene, times(17)[16:])
     assert (answer.event, answer.fates) == (Event.LOST, [Fate.KEPT, Fate.KEPT])
-    assert (await store.read(scene)).instants == (await other.read(scene)).instants
+    assert (await store.read(scene, 99.0)).instants == (await other.read(scene, 99.0)).instants
 
 
 @pytest.mark.parametrize(
@@ -199,7 +199,7 @@ async def test_a_damaged_entry_is_left_out(
     redis_server.command("hset", SceneKeys(scene).log, "5", damaged)
     (answer,) = await replay([other], scene, times(13)[12:])
     assert (answer.event, answer.fates) == (Event.KEPT, [Fate.KEPT, Fate.KEPT])
-    held = unpack_instants((await other.read(scene, "a")).instants.packed)
+    held = unpack_instants((await other.read(scene, 99.0, "a")).instants.packed)
     assert len(held) == 12  # all but one
 
 
@@ -240,13 +240,71 @@ async def test_the_log_is_bounded_and_expires(redis_server: Process) -> None:
     log = SceneKeys(scene).log
     async with opened(redis_server.url, expiry=12.0) as store:
         await replay([store], scene, times(60))
-        # A call a time: 19 of 9 s, and the ones that are dropped with the next call
-        entries = (number(redis_server, "hlen", log) - 2) / 2
-        assert entries <= 20
+        # A call a time: 22 of 10.5 s, and the one that is dropped with the next call
+        entries = (number(redis_server, "hlen", log) - 3) / 2
+        assert entries <= 23
         assert 11_000 < number(redis_server, "pttl", log) <= 12_000
         for agent in range(MAX_ENTRIES + 50):  # all at one time
             await store.exchange(scene, times(60)[-1], [sighting(times(60)[-1], f"{agent}", series="")])
-        assert (number(redis_server, "hlen", log) - 2) / 2 == MAX_ENTRIES
+        assert (number(redis_server, "hlen", log) - 3) / 2 == MAX_ENTRIES
+
+
+async def test_the_log_is_bounded_where_a_recording_is_played_again(
+    redis_server: Process, store: RedisStore
+) -> None:
+    scene = scene_name()
+    log = SceneKeys(scene).log
+    for _ in range(4):
+        await replay([store], scene, times(60))
+    await replay([store], scene, [times(60)[-1] + 100.0])  # a clock that is far ahead for once
+    await replay([store], scene, times(60))
+    assert (number(redis_server, "hlen", log) - 3) / 2 <= 23
+
+
+async def test_a_server_that_sat_out_for_long_goes_on(store: RedisStore, other: RedisStore) -> None:
+    scene = scene_name()
+    await replay([store], scene, times(10))
+    await replay([other], scene, times(60)[10:])  # by now what the first one knew is no longer needed
+    (answer,) = await replay([store], scene, times(61)[60:])
+    assert (answer.event, answer.fates) == (Event.KEPT, [Fate.KEPT, Fate.KEPT])
+    assert len(rows([answer])) == 2
+
+
+async def test_reading_takes_nothing_from_the_next_call(
+    redis_server: Process, store: RedisStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = scene_name()
+    answers = await replay([store], scene, times(12))
+    run = store._append.run
+
+    async def lose(*arguments: object) -> object:
+        await run(*arguments)  # type: ignore[arg-type]
+        raise TimeoutError
+
+    monkeypatch.setattr(store._append, "run", lose)
+    with pytest.raises(TimeoutError):
+        await replay([store], scene, times(13)[12:])
+    monkeypatch.undo()
+    await store.read(scene, 99.0)
+    answers += await replay([store], scene, times(14)[13:])
+    assert rows(answers) == rows(await replay([memory()], scene, times(14)))
+
+    redis_server.command("del", SceneKeys(scene).log)
+    await store.read(scene, 99.0)
+    (answer,) = await replay([store], scene, times(15)[14:])
+    assert answer.event is Event.LOST
+
+
+async def test_something_else_in_the_events_place(redis_server: Process, store: RedisStore) -> None:
+    scene = scene_name()
+    redis_server.command("set", SceneKeys(scene).events, "hello")
+    redis_server.command("set", SceneKeys(scene).published, "hello")
+    await store.publish(scene, [b"1"])
+    source = store.watch(scene)
+    assert await anext(source) == ((), 0)
+    await store.publish(scene, [b"2"])
+    assert await anext(source) == ([b"2"], 0)
+    await source.aclose()
 
 
 @pytest.mark.parametrize(("step", "most"), [(0.5, 24_000), (0.1, 110_000)])

@@ -84,8 +84,9 @@ def test_a_second_answer_tells_what_was_settled_but_not_anew() -> None:
 def test_of_one_time_what_came_first_is_kept() -> None:
     scene = SceneMemory()
     moments = list(times(13))
-    replay(scene, moments[:12], miss=1.0)
-    replay(scene, moments[:12], miss=7.0)
+    for moment in moments[:12]:
+        replay(scene, [moment], miss=1.0)
+        replay(scene, [moment], miss=7.0)
     found = settled(replay(scene, moments[12:]))
     assert found["a", SERIES, moments[12]]["blocks"]["point"][:, 1, 1].tolist() == [1.0] * AGES
 
@@ -117,7 +118,7 @@ async def test_the_nearest_forecast_is_taken_and_none_beyond_the_tolerance() -> 
     for moment in moments[:12]:
         replay(scene, [moment - 0.08, moment + 0.04])
     replay(scene, [moments[12], moments[12] + SETTLE_AFTER])
-    _, instants = await scene.everything()
+    _, instants = await scene.everything(99.0)
     rows = unpack_instants(bundle(instants).packed)
     (row,) = rows[rows["time"] == moments[12]]
     assert np.allclose(row["made_at"], np.array(moments[11::-1]) + 0.04, rtol=0, atol=1e-6)
@@ -193,17 +194,58 @@ def test_an_id_that_another_agent_has_begins_anew(off: float) -> None:
 def test_a_contradiction_at_one_time_begins_anew_but_noise_does_not() -> None:
     scene = SceneMemory()
     replay(scene, list(times(3)))
-    assert [o.fates for o in replay(scene, [times(3)[-1]], off=4.9)] == [[Fate.KEPT]]
-    assert [o.fates for o in replay(scene, [times(3)[-1]], off=5.1)] == [[Fate.RESET]]
+    assert [o.fates for o in replay(scene, [times(3)[-1]], off=0.09)] == [[Fate.KEPT]]
+    assert [o.fates for o in replay(scene, [times(3)[-1]], off=0.11)] == [[Fate.RESET]]
 
 
-def test_a_clock_that_jumps_back_begins_anew() -> None:
+@pytest.mark.parametrize("jump", [2.1, 3.04, 3600.0])
+@pytest.mark.parametrize("step", [0.1, 0.5])
+def test_a_clock_that_jumps_back_begins_anew(jump: float, step: float) -> None:
     scene = SceneMemory()
-    replay(scene, list(times(20)))
-    back = [t - 3600.0 for t in times(13)]
-    outcomes = replay(scene, back)
-    assert [outcome.fates[0] for outcome in outcomes] == [Fate.RESET] + [Fate.KEPT] * 12
-    assert [time for _, _, time in settled(outcomes)] == [back[-1]]
+    moments = list(times(round(10 / step), step))
+    replay(scene, moments, speed=1.0)
+    back = [moments[-1] - jump + step * number for number in range(round(7 / step))]
+    outcomes = replay(scene, back, speed=1.0, off=0.01)
+    assert [outcome.fates[0] for outcome in outcomes] == [Fate.RESET] + [Fate.KEPT] * (len(back) - 1)
+    found = settled(outcomes)
+    assert found
+    assert all((row["made_at"] >= back[0]).all() for row in found.values())
+
+
+def test_a_clock_that_jumps_back_a_little_is_seen_where_the_agent_is() -> None:
+    scene = SceneMemory()
+    replay(scene, list(times(20, 0.1)))
+    step_back = times(20, 0.1)[9]
+    at = observation(step_back, where(times(21, 0.1)[-1]))  # it has gone on meanwhile
+    outcome = scene.apply(Entry(step_back, [Sighting("a", b"v", at)]))
+    assert outcome.fates == [Fate.RESET]
+
+
+@pytest.mark.parametrize(("step", "jitter"), [(0.5, 0.04), (0.1, 0.02), (0.1, 0.049)])
+def test_the_order_of_arrival_makes_no_difference_off_the_lags(step: float, jitter: float) -> None:
+    rng = random.Random(7)
+    moments = [t + rng.uniform(-jitter, jitter) for t in times(round(40 / step), step)]
+    last = [moments[-1] + 0.5 * number for number in range(1, 6)]  # until all is settled
+    in_order = settled(replay(SceneMemory(), [*moments, *last]))
+    shuffled = sorted(moments, key=lambda t: t + rng.uniform(0, 1.9))
+    found = settled(replay(SceneMemory(), [*shuffled, *last]))
+    assert len(in_order) > 20 / step
+    assert found.keys() == in_order.keys()
+    assert all(found[key].tobytes() == in_order[key].tobytes() for key in found)
+
+
+def test_who_is_always_late_is_as_well_known() -> None:
+    scene = SceneMemory()
+    rng = random.Random(3)
+    outcomes = []
+    for moment in times(80):
+        t = moment + rng.uniform(-0.04, 0.04)
+        outcomes.append(scene.apply(Entry(t, [sighting(t, "prompt")])))
+        t = moment - 1.5 + rng.uniform(-0.04, 0.04)
+        outcomes.append(scene.apply(Entry(t, [sighting(t, "late", off=9.0)])))
+    counts = {name: sum(key[0] == name for key in settled(outcomes)) for name in ("prompt", "late")}
+    assert counts["prompt"] > 60
+    assert abs(counts["late"] - counts["prompt"]) <= 1  # at the end one of them has yet to wait
 
 
 async def test_what_is_older_than_the_window_is_forgotten() -> None:
@@ -211,7 +253,7 @@ async def test_what_is_older_than_the_window_is_forgotten() -> None:
     replay(scene, list(times(12)))
     far = START + 5.5 + WINDOW + 0.1
     scene.apply(Entry(far, [sighting(far, "b")]))
-    assert (await scene.everything())[0] == ["b"]
+    assert (await scene.everything(99.0))[0] == ["b"]
     (outcome,) = replay(scene, [far])
     assert outcome.fates == [Fate.NEW]
 
@@ -239,7 +281,7 @@ def test_histories_are_what_was_seen_up_to_the_call() -> None:
         return np.frombuffer(history).reshape(-1, 9)[:, 0].tolist()  # type: ignore[no-any-return]
 
     assert recalled(moments[-1] + 0.5, 2.0) == [*moments[-4:], moments[-1] + 0.5]
-    assert recalled(moments[4], 1.0) == moments[2:5]  # a late call sees nothing of what came after it
+    assert recalled(moments[7], 1.0) == moments[5:8]  # a late call sees nothing of what came after it
     assert recalled(moments[-1] + 0.5, 0.0) == [moments[-1] + 0.5]
 
 

@@ -58,9 +58,9 @@ async def test_any_name_will_do(store: TrackStore, name: str) -> None:
         brought = [sighting(moment, name or "a"), sighting(moment, "other", off=9.0)]
         answer = await store.exchange(scene, moment, brought)
     assert sorted(newly([answer])) == sorted((one, SERIES, moments[-1]) for one in (name or "a", "other"))
-    held = await store.read(scene, name or "a")
+    held = await store.read(scene, 99.0, name or "a")
     assert list(held.agent_ids) == [name or "a"]
-    assert len((await store.read(scene)).agent_ids) == 2
+    assert len((await store.read(scene, 99.0)).agent_ids) == 2
     assert await store.reset(scene) == 2
 
 
@@ -87,20 +87,20 @@ async def test_all_that_is_remembered_can_be_read(store: TrackStore) -> None:
         await store.exchange(
             scene, moment, [sighting(moment, "a"), sighting(moment, "b", series="", off=20.0)]
         )
-    held = await store.read(scene)
+    held = await store.read(scene, 99.0)
     assert sorted(held.agent_ids) == ["a", "b"]
     assert list(held.instants.agent_ids) == ["a"] * 14  # of the other one nothing was forecast
     rows = unpack_instants(held.instants.packed)
     assert rows["time"].tolist() == list(moments)
     assert (rows["flags"] & (COMPLETE | SETTLED)).tolist() == [0] * 12 + [COMPLETE | SETTLED] * 2
-    assert (await store.read(scene, "nobody")).agent_ids in ([], ())
-    assert (await store.read(scene_name())).agent_ids in ([], ())
+    assert (await store.read(scene, 99.0, "nobody")).agent_ids in ([], ())
+    assert (await store.read(scene_name(), 99.0)).agent_ids in ([], ())
 
 
 async def test_reading_changes_nothing(store: TrackStore) -> None:
     scene = scene_name()
     await replay(store, scene, times(12))
-    await store.read(scene)
+    await store.read(scene, 99.0)
     assert newly(await replay(store, scene, times(13)[12:])) == [("a", SERIES, times(13)[-1])]
 
 

@@ -27,14 +27,14 @@ class _TrackingStatus:
 class _TrackingStatusEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_TrackingStatus.ValueType], _builtins.type):
     DESCRIPTOR: _descriptor.EnumDescriptor
     TRACKING_STATUS_UNSPECIFIED: _TrackingStatus.ValueType  # 0
-    """Not tracked: the call names no scene."""
+    """Not tracked: the call names no scene, or nothing usable was said of the agent."""
     TRACKING_STATUS_OK: _TrackingStatus.ValueType  # 1
     TRACKING_STATUS_NEW: _TrackingStatus.ValueType  # 2
     """Nothing was remembered before."""
     TRACKING_STATUS_RESET: _TrackingStatus.ValueType  # 3
     """What was remembered did not fit and was forgotten: the agent's type changed, it is farther from where it was
-    than 100 m/s and 5 m allow, or the call's time is more than 9 s before the scene's newest (a clock that jumped
-    back). Of a scene: the memory that this server knew is gone; another one reset it, or the store has lost it.
+    than 100 m/s and 5 m allow (0.1 m, at one time), or the call's time is more than 2 s before the scene's newest (a
+    clock that jumped back). Of a scene: the memory that this server knew is gone; another one reset it, or the store has lost it.
     """
     TRACKING_STATUS_UNAVAILABLE: _TrackingStatus.ValueType  # 4
     """The track memory did not answer in time: nothing could be recalled, and nothing is certain to be remembered."""
@@ -43,14 +43,14 @@ class TrackingStatus(_TrackingStatus, metaclass=_TrackingStatusEnumTypeWrapper):
     """What became of the memory of an agent or a scene in a call."""
 
 TRACKING_STATUS_UNSPECIFIED: TrackingStatus.ValueType  # 0
-"""Not tracked: the call names no scene."""
+"""Not tracked: the call names no scene, or nothing usable was said of the agent."""
 TRACKING_STATUS_OK: TrackingStatus.ValueType  # 1
 TRACKING_STATUS_NEW: TrackingStatus.ValueType  # 2
 """Nothing was remembered before."""
 TRACKING_STATUS_RESET: TrackingStatus.ValueType  # 3
 """What was remembered did not fit and was forgotten: the agent's type changed, it is farther from where it was
-than 100 m/s and 5 m allow, or the call's time is more than 9 s before the scene's newest (a clock that jumped
-back). Of a scene: the memory that this server knew is gone; another one reset it, or the store has lost it.
+than 100 m/s and 5 m allow (0.1 m, at one time), or the call's time is more than 2 s before the scene's newest (a
+clock that jumped back). Of a scene: the memory that this server knew is gone; another one reset it, or the store has lost it.
 """
 TRACKING_STATUS_UNAVAILABLE: TrackingStatus.ValueType  # 4
 """The track memory did not answer in time: nothing could be recalled, and nothing is certain to be remembered."""
@@ -160,7 +160,9 @@ class InstantConsistency(_message.Message):
     complete: _builtins.bool
     """Whether there is a forecast of each age, 0.5 to 6 s. Dispersion and convergence are given then only."""
     settled: _builtins.bool
-    """Whether it is final and counted."""
+    """Whether it is final, and was counted by the server that found it out. (A while later forecasts of it are
+    forgotten, and it is told as not complete any more.)
+    """
     @_builtins.property
     def model(self) -> _model_service_pb2.ModelReference: ...
     @_builtins.property
@@ -341,7 +343,7 @@ class GetAgentConsistencyRequest(_message.Message):
     scene_id: _builtins.str
     agent_id: _builtins.str
     window: _builtins.float
-    """s back from the agent's newest observation, at most 9; 0: 2 s."""
+    """s back from the agent's newest observation, at most 10.5; 0: 2 s."""
     def __init__(
         self,
         *,
@@ -410,7 +412,7 @@ class GetSceneConsistencyResponse(_message.Message):
 
     @_builtins.property
     def models(self) -> _containers.RepeatedCompositeFieldContainer[Global___ModelConsistency]:
-        """Settled sets among all that is remembered of the scene."""
+        """Settled sets of each agent's last 4 s."""
 
     def __init__(
         self,

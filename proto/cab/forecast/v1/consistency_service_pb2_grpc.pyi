@@ -38,9 +38,10 @@ class ConsistencyServiceStub:
 
     A set with a forecast of each age is complete. It is settled, which means final and counted, at once where
     each was made on its lag (to 0.1 ms), and otherwise when the agent was observed 2 s later: until then a nearer
-    forecast may come. So the order in which calls arrive makes no difference, as long as they are at most
-    2 s late; calls that are later than that may find what they need gone. What is older than 9 s before the
-    scene's newest call is forgotten, and a scene without a call for 30 s (a setting of the server) as a whole.
+    forecast may come. So the order in which calls arrive makes no difference, as long as none is for a time more than
+    2 s before the scene's newest. One that is, of a clock that was put back or a recording that is played again, begins
+    the scene anew. Of one time and agent what came first is kept. What is older than 10.5 s before the scene's newest
+    call is forgotten, and a scene without a call for 30 s (a setting of the server) as a whole.
 
     Errors as PredictionService's. NOT_FOUND (reason UNKNOWN_TRACK): nothing is remembered of that scene or agent.
     UNAVAILABLE: the track memory does not answer.
@@ -77,9 +78,10 @@ class ConsistencyServiceAsyncStub(ConsistencyServiceStub):
 
     A set with a forecast of each age is complete. It is settled, which means final and counted, at once where
     each was made on its lag (to 0.1 ms), and otherwise when the agent was observed 2 s later: until then a nearer
-    forecast may come. So the order in which calls arrive makes no difference, as long as they are at most
-    2 s late; calls that are later than that may find what they need gone. What is older than 9 s before the
-    scene's newest call is forgotten, and a scene without a call for 30 s (a setting of the server) as a whole.
+    forecast may come. So the order in which calls arrive makes no difference, as long as none is for a time more than
+    2 s before the scene's newest. One that is, of a clock that was put back or a recording that is played again, begins
+    the scene anew. Of one time and agent what came first is kept. What is older than 10.5 s before the scene's newest
+    call is forgotten, and a scene without a call for 30 s (a setting of the server) as a whole.
 
     Errors as PredictionService's. NOT_FOUND (reason UNKNOWN_TRACK): nothing is remembered of that scene or agent.
     UNAVAILABLE: the track memory does not answer.
@@ -112,9 +114,10 @@ class ConsistencyServiceServicer(metaclass=_abc_1.ABCMeta):
 
     A set with a forecast of each age is complete. It is settled, which means final and counted, at once where
     each was made on its lag (to 0.1 ms), and otherwise when the agent was observed 2 s later: until then a nearer
-    forecast may come. So the order in which calls arrive makes no difference, as long as they are at most
-    2 s late; calls that are later than that may find what they need gone. What is older than 9 s before the
-    scene's newest call is forgotten, and a scene without a call for 30 s (a setting of the server) as a whole.
+    forecast may come. So the order in which calls arrive makes no difference, as long as none is for a time more than
+    2 s before the scene's newest. One that is, of a clock that was put back or a recording that is played again, begins
+    the scene anew. Of one time and agent what came first is kept. What is older than 10.5 s before the scene's newest
+    call is forgotten, and a scene without a call for 30 s (a setting of the server) as a whole.
 
     Errors as PredictionService's. NOT_FOUND (reason UNKNOWN_TRACK): nothing is remembered of that scene or agent.
     UNAVAILABLE: the track memory does not answer.
