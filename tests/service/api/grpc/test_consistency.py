@@ -57,7 +57,7 @@ async def test_calls(
 ) -> None:
     assert await getattr(stub, method)(request_, metadata=TOKEN) == answer
     assert plane.asked == [request_]
-    assert count(server, "grpc", method, "OK") == 1
+    await until(lambda: count(server, "grpc", method, "OK") == 1)
     with pytest.raises(grpc.aio.AioRpcError) as caught:
         await getattr(stub, method)(request_)
     assert from_grpc(caught.value).reason == "UNAUTHENTICATED"
@@ -74,7 +74,7 @@ async def test_watch_gives_events_as_they_come(server: Server, plane: FakePlane,
     plane.send(None)
     assert [event async for event in events] == []
     assert await call.code() is grpc.StatusCode.OK
-    assert count(server, "grpc", "WatchScene", "OK") == 1
+    await until(lambda: count(server, "grpc", "WatchScene", "OK") == 1)
     assert plane.watching == 0
 
 
@@ -114,14 +114,14 @@ async def test_a_watch_ends_well_when_the_server_drains(server: Server, plane: F
         await server.stop()
     assert [event async for event in call] == [BEGUN]
     assert await call.code() is grpc.StatusCode.OK
-    assert count(server, "grpc", "WatchScene", "OK") == 1
+    await until(lambda: count(server, "grpc", "WatchScene", "OK") == 1)
 
 
 async def test_errors_of_a_watch_have_details(server: Server, plane: FakePlane, stub: Any) -> None:
     plane.error = Overloaded("too many watch", 2.0)
     error = await failure(stub.WatchScene(WATCH, metadata=TOKEN))
     assert (error.code, error.reason, error.retry_after) == ("RESOURCE_EXHAUSTED", "OVERLOADED", 2.0)
-    assert count(server, "grpc", "WatchScene", "RESOURCE_EXHAUSTED") == 1
+    await until(lambda: count(server, "grpc", "WatchScene", "RESOURCE_EXHAUSTED") == 1)
 
 
 async def test_errors_in_the_midst_of_a_watch(server: Server, plane: FakePlane, stub: Any) -> None:
@@ -133,7 +133,7 @@ async def test_errors_in_the_midst_of_a_watch(server: Server, plane: FakePlane, 
     assert [await anext(events), await anext(events)] == [BEGUN, EVENT]
     error = await failure(events)
     assert (error.code, error.message, error.reason) == ("UNAVAILABLE", "it is gone", "TRACKING_UNAVAILABLE")
-    assert count(server, "grpc", "WatchScene", "UNAVAILABLE") == 1
+    await until(lambda: count(server, "grpc", "WatchScene", "UNAVAILABLE") == 1)
     call = stub.WatchScene(WATCH, metadata=TOKEN)
     await until(lambda: plane.watching == 1)
     plane.send(KeyError("secret"))
@@ -144,7 +144,7 @@ async def test_errors_in_the_midst_of_a_watch(server: Server, plane: FakePlane, 
 
 async def test_a_watch_needs_a_token_and_a_message(server: Server, plane: FakePlane, stub: Any) -> None:
     assert (await failure(stub.WatchScene(WATCH))).reason == "UNAUTHENTICATED"
-    assert count(server, "grpc", "WatchScene", "UNAUTHENTICATED") == 1
+    await until(lambda: count(server, "grpc", "WatchScene", "UNAUTHENTICATED") == 1)
     async with grpc.aio.insecure_channel(server.grpc_address) as channel:
         watch = channel.unary_stream("/cab.forecast.v1.ConsistencyService/WatchScene", None, None)
         assert (await failure(watch(b"\xff\xff", metadata=TOKEN))).faults[0][0] == "body"

@@ -166,7 +166,7 @@ async def test_events(server: Server, plane: FakePlane, client: httpx.AsyncClien
             plane.send(EVENT)
             event = await reader.read()
             assert json_format.Parse(event.removeprefix("data: "), pb.WatchSceneResponse()) == EVENT
-        assert count(server, "rest", "WatchScene", "OK") == 0
+        await until(lambda: count(server, "rest", "WatchScene", "OK") == 0)
         plane.send(None)
         assert await reader.read() == ""
     assert plane.watching == 0
@@ -228,7 +228,7 @@ async def test_events_end_when_the_server_drains(
         async with asyncio.timeout(5):
             await server.stop()
         assert await reader.read() == ""
-    assert count(server, "rest", "WatchScene", "OK") == 1
+    await until(lambda: count(server, "rest", "WatchScene", "OK") == 1)
 
 
 async def test_events_end_at_the_time_given(
@@ -255,7 +255,7 @@ async def test_errors_before_the_first_event_are_problems(
     plane.error = Overloaded("too many watch", 2.0)
     error = from_problem(await client.get(EVENTS))
     assert (error.http_status, error.reason, error.retry_after) == (429, "OVERLOADED", 2.0)
-    assert count(server, "rest", "WatchScene", "RESOURCE_EXHAUSTED") == 1
+    await until(lambda: count(server, "rest", "WatchScene", "RESOURCE_EXHAUSTED") == 1)
     refused = await client.get(EVENTS, headers={"accept": "application/json"})
     assert from_problem(refused).reason == "NOT_ACCEPTABLE"
 
