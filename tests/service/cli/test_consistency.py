@@ -84,7 +84,10 @@ def test_tables() -> None:
 
 def test_watch(plane: FakePlane, server: Server) -> None:
     """In a process of its own, ended by Ctrl-C."""
-    command = [sys.executable, "-m", "service", "consistency", "watch", "s"]
+    # Whoever runs the tests in the background has Ctrl-C ignored, and so would this
+    heed = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    program = f"{heed}; from service.cli.main import app; app()"
+    command = [sys.executable, "-c", program, "consistency", "watch", "s"]
     for options, expected in (([], "C(1 m) 2.5"), (["--json"], '"missed"')):
         with subprocess.Popen(  # noqa: S603
             [*command, *options],
@@ -92,16 +95,19 @@ def test_watch(plane: FakePlane, server: Server) -> None:
             text=True,
             env={**os.environ, "PYTHONUNBUFFERED": "1"},
         ) as process:
-            plane.wait(1)
-            plane.send(EVENT)
-            assert process.stdout is not None
-            lines = [process.stdout.readline()]
-            if not options:
-                assert lines == ["2 events were missed\n"]
-                lines.append(process.stdout.readline())
-            assert expected in lines[-1]
-            process.send_signal(signal.SIGINT)
-            assert process.wait(10) == 0
+            try:
+                plane.wait(1)
+                plane.send(EVENT)
+                assert process.stdout is not None
+                lines = [process.stdout.readline()]
+                if not options:
+                    assert lines == ["2 events were missed\n"]
+                    lines.append(process.stdout.readline())
+                assert expected in lines[-1]
+                process.send_signal(signal.SIGINT)
+                assert process.wait(10) == 0
+            finally:
+                process.kill()  # or a failure would wait for it for ever
         plane.wait(0)
 
 
