@@ -7,7 +7,7 @@ from loadtest.stores import Store
 from loadtest.traffic import START, Traffic
 
 MODEL = "kalman"
-SECONDS = 8.5
+SECONDS = 11.5
 """Of each scene's time: a little more than is remembered."""
 _SCENE_AGENTS = 40
 _CALLS = 4

@@ -17,6 +17,8 @@ from tests.service.history.redis_servers import HOST, Process
 
 _EXPIRY = 3600
 """s; longer than anything here takes."""
+_AGENTS = 50_000
+"""More than there are here."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,9 @@ def stores(models: Path) -> Iterator[list[Store]]:
         found = []
         for name, redis_process in (("in-process", None), ("Redis", server)):
             url = "memory" if redis_process is None else redis_process.url
-            process = stack.enter_context(serving(models, store=url, track_expiry=_EXPIRY))
+            process = stack.enter_context(
+                serving(models, store=url, track_expiry=_EXPIRY, max_tracked_agents=_AGENTS)
+            )
             client = stack.enter_context(Client(f"grpc://{process.grpc}", timeout=30, retries=0))
             found.append(Store(name, client, psutil.Process(process.process.pid), redis_process))
         yield found
