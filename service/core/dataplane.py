@@ -280,15 +280,16 @@ class DataPlane:
     ) -> tuple[Agents, Tracked]:
         """The agents, with what the memory knows of them."""
         agents = await self._in_thread(read_agents, request, self._settings)
+        own = observed(agents, (forecaster, call.catalog.fallback))
         tracked = await self._tracker.exchange(
             options.scene_id,
             options.time,
-            observed(agents, (forecaster, call.catalog.fallback)),
+            own,
             call.left() - _RESERVE,
             recall=history_seconds(frames_of(forecaster, call.catalog)),
             latest=options.consistency,
         )
-        return with_histories(agents, tracked.histories), tracked
+        return with_histories(agents, own, tracked.histories), tracked
 
     async def _remember(self, options: Options, brought: Sequence[Sighting], call: Call) -> Tracked:
         latest = options.consistency and not options.recalls

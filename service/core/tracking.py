@@ -51,20 +51,17 @@ def observed(agents: Agents, models: tuple[Forecaster, Forecaster]) -> list[Sigh
     ]
 
 
-def with_histories(agents: Agents, histories: Mapping[str, bytes]) -> Agents:
+def with_histories(agents: Agents, own: Sequence[Sighting], histories: Mapping[str, bytes]) -> Agents:
     """Agents with what the memory recalls of them.
 
     Args:
         agents: of the call.
+        own: what the call says of them, of ``observed``.
         histories: by id, each with the call's own observations; empty where the memory did not answer.
     """
-    if agents.observations is None or not histories:
+    if not own or not histories:
         return agents
-    own = pack_observations(agents.observations, newest_only=False)
-    packed = [
-        histories.get(agents.ids[index]) or alone
-        for index, alone in zip(agents.valid.tolist(), own, strict=True)
-    ]
+    packed = [histories.get(one.agent_id) or one.observations for one in own]
     return replace(agents, observations=unpack_observations(packed))
 
 

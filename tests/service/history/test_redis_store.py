@@ -61,6 +61,22 @@ def number(server: Process, *words: str) -> int:
     return answer
 
 
+async def lose_the_answer(
+    store: RedisStore, scene: str, moments: Sequence[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Calls that Redis gets, but of which no answer comes."""
+    run = store._append.run
+
+    async def lose(*arguments: object) -> object:
+        await run(*arguments)  # type: ignore[arg-type]
+        raise TimeoutError
+
+    with monkeypatch.context() as patched:
+        patched.setattr(store._append, "run", lose)
+        with pytest.raises(TimeoutError):
+            await replay([store], scene, moments)
+
+
 async def test_two_servers_in_turn_are_as_one(store: RedisStore, other: RedisStore) -> None:
     rng = random.Random(3)
     moments = sorted(times(60), key=lambda t: t + rng.uniform(0, 1.5))
@@ -221,16 +237,7 @@ async def test_an_entry_whose_answer_was_lost_counts_all_the_same(
 ) -> None:
     scene = scene_name()
     answers = await replay([store], scene, times(12))
-    run = store._append.run
-
-    async def lose(*arguments: object) -> object:
-        await run(*arguments)  # type: ignore[arg-type]
-        raise TimeoutError
-
-    monkeypatch.setattr(store._append, "run", lose)
-    with pytest.raises(TimeoutError):
-        await replay([store], scene, times(13)[12:])
-    monkeypatch.undo()
+    await lose_the_answer(store, scene, times(13)[12:], monkeypatch)
     answers += await replay([store], scene, times(14)[13:])
     assert rows(answers) == rows(await replay([memory()], scene, times(14)))
 
@@ -275,16 +282,7 @@ async def test_reading_takes_nothing_from_the_next_call(
 ) -> None:
     scene = scene_name()
     answers = await replay([store], scene, times(12))
-    run = store._append.run
-
-    async def lose(*arguments: object) -> object:
-        await run(*arguments)  # type: ignore[arg-type]
-        raise TimeoutError
-
-    monkeypatch.setattr(store._append, "run", lose)
-    with pytest.raises(TimeoutError):
-        await replay([store], scene, times(13)[12:])
-    monkeypatch.undo()
+    await lose_the_answer(store, scene, times(13)[12:], monkeypatch)
     await store.read(scene, 99.0)
     answers += await replay([store], scene, times(14)[13:])
     assert rows(answers) == rows(await replay([memory()], scene, times(14)))
