@@ -56,6 +56,11 @@ class ModelInfo(BaseModel):
     license: str
 
     @property
+    def full_name(self) -> str:
+        """``name@version``, which names this model and no other."""
+        return f"{self.name}@{self.version}"
+
+    @property
     def horizon(self) -> float:
         """Longest forecast, s."""
         return self.steps * STEP_SECONDS

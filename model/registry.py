@@ -55,7 +55,7 @@ class Registry:
             info = forecaster.info
             versions = self._models.setdefault(info.name, {})
             if (version := Version(info.version)) in versions:
-                raise DuplicateModelError(f"there are two models {_key(info)}")
+                raise DuplicateModelError(f"there are two models {info.full_name}")
             versions[version] = forecaster
 
     @classmethod
@@ -102,8 +102,8 @@ class Registry:
         try:
             return versions[Version(version)]
         except (InvalidVersion, KeyError):
-            namesakes = [_key(info) for info in self.passed_over if info.name == base]
-            raise UnknownModelError(name, [_key(info) for info in self.infos()], namesakes) from None
+            namesakes = [info.full_name for info in self.passed_over if info.name == base]
+            raise UnknownModelError(name, [info.full_name for info in self.infos()], namesakes) from None
 
     def infos(self) -> list[ModelInfo]:
         """What is known of each model, by name, then by version, oldest first."""
@@ -122,10 +122,6 @@ class Registry:
         except UnknownModelError:
             return False
         return True
-
-
-def _key(info: ModelInfo) -> str:
-    return f"{info.name}@{info.version}"
 
 
 def _is_causal(info: ModelInfo) -> bool:
@@ -163,7 +159,7 @@ def _refuse(checkpoint: Checkpoint) -> NoReturn:
 
     raise CheckpointError(
         checkpoint.folder,
-        f"{_key(checkpoint.info)} is of the paper protocol, and there is no other checkpoint: it was "
+        f"{checkpoint.info.full_name} is of the paper protocol, and there is no other checkpoint: it was "
         "trained on states that contain the near future, which a live service cannot see; load it, with "
         "--allow-paper-protocol, only to reproduce published tables",
     )

@@ -161,7 +161,7 @@ def _load_models(settings: Settings) -> Registry:
         log(
             "models passed over: they are of the paper protocol",
             folder=str(folder),
-            models=[f"{info.name}@{info.version}" for info in registry.passed_over],
+            models=[info.full_name for info in registry.passed_over],
             load_with="--allow-paper-protocol or FORECAST_ALLOW_PAPER_PROTOCOL=true",
         )
     return registry

@@ -13,7 +13,6 @@ from model.arrays import Floats
 from model.data.checks import FUTURE_STEPS, STEPS_AHEAD, check_pairs
 from model.data.protocols import SceneFrames
 from model.data.scenes import DataError, Pair, Reader, SceneRecord
-from model.evaluation.subjects import key
 from model.forecaster import Features, Forecaster, Protocol, join
 from model.kalman import HISTORY_FRAMES
 from model.metrics.aggregate import MetricMeans
@@ -63,7 +62,7 @@ def judge_baselines(
     Raises:
         DataError: the data is bad, or the split has no pairs.
     """
-    rows = [key(one.info) for one in baselines] + [ORACLE] * oracle
+    rows = [one.info.full_name for one in baselines] + [ORACLE] * oracle
     means = {row: MetricMeans() for row in rows}
     forecasters = {one.info.name: one for one in (*(physics.baselines() if oracle else ()), *baselines)}
     done = 0
@@ -78,7 +77,7 @@ def judge_baselines(
             metrics = instance_metrics(
                 mixtures[one.info.name], pairs.truth, rasters, seeds, samples=samples, draws=draws
             )
-            means[key(one.info)].add(metrics)
+            means[one.info.full_name].add(metrics)
         if oracle:
             best = oracle_mixture(mixtures, pairs.truth)
             means[ORACLE].add(oracle_figures(instance_metrics(best, pairs.truth, rasters)))

@@ -11,7 +11,7 @@ from model.data.caches import open_cache
 from model.data.checks import FUTURE_STEPS
 from model.data.scenes import Reader
 from model.evaluation.ablation import Without, ablations
-from model.evaluation.subjects import Learned, key
+from model.evaluation.subjects import Learned
 from model.forecaster import Protocol
 from model.metrics.aggregate import MetricMeans
 from model.networks.config import AnyNetworkConfig, NetworkConfig
@@ -51,10 +51,10 @@ def judge_learned(
     Returns:
         By ``key``.
     """
-    judged = {key(model.info): Judged() for model in models}
+    judged = {model.info.full_name: Judged() for model in models}
     for batch in validation.batches(limit):
         for model in models:
-            own = judged[key(model.info)]
+            own = judged[model.info.full_name]
             mixture = model.forecaster.forecast(batch.features, AgentType.VEHICLE, steps=FUTURE_STEPS)
             own.metrics.add(batch.metrics(mixture, samples, draws))
             for without, take_away in ablations(model.info).items() if ablate else ():

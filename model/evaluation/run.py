@@ -9,7 +9,7 @@ from model.data.scenes import DataError, Reader
 from model.evaluation.baselines import judge_baselines
 from model.evaluation.learned import Judged, judge_learned, open_validations
 from model.evaluation.results import Results, Row
-from model.evaluation.subjects import Subjects, key
+from model.evaluation.subjects import Subjects
 from model.evaluation.tables import markdown
 from model.forecaster import ModelInfo, Protocol
 from model.metrics.aggregate import MetricMeans
@@ -98,10 +98,10 @@ class Evaluation:
     def _rows(self, judged: Mapping[str, Judged]) -> tuple[Row, ...]:
         """In the order of the tables: baselines, oracle, checkpoints."""
         subjects = self.subjects
-        rows = [_row(one.info, judged[key(one.info)], learned=False) for one in subjects.baselines]
+        rows = [_row(one.info, judged[one.info.full_name], learned=False) for one in subjects.baselines]
         if subjects.oracle:
             rows.append(Row(ORACLE, "", learned=False, trained_on="", metrics=judged[ORACLE].metrics.means()))
-        rows += [_row(one.info, judged[key(one.info)], learned=True) for one in subjects.learned]
+        rows += [_row(one.info, judged[one.info.full_name], learned=True) for one in subjects.learned]
         return tuple(rows)
 
 

@@ -45,15 +45,10 @@ class Subjects:
         """Keys of all (see ``key``)."""
         oracle = (ORACLE,) if self.oracle else ()
         return (
-            *(key(one.info) for one in self.baselines),
+            *(one.info.full_name for one in self.baselines),
             *oracle,
-            *(key(one.info) for one in self.learned),
+            *(one.info.full_name for one in self.learned),
         )
-
-
-def key(info: ModelInfo) -> str:
-    """``name@version``."""
-    return f"{info.name}@{info.version}"
 
 
 def choose(folder: Path | None, protocol: Protocol, only: Collection[str] = ()) -> Subjects:
@@ -75,7 +70,7 @@ def choose(folder: Path | None, protocol: Protocol, only: Collection[str] = ()) 
     _check_names(infos, protocol, only)
     if not fitting and not only:
         where = "no folder of checkpoints is given, and none are bundled" if folder is None else str(folder)
-        others = ", ".join(f"{key(one.info)} ({one.info.protocol.value})" for one in checkpoints)
+        others = ", ".join(f"{one.info.full_name} ({one.info.protocol.value})" for one in checkpoints)
         raise EvaluationError(
             f"{where}: there is no checkpoint of the {protocol.value} protocol that forecasts vehicles"
             + (f"; there are {others}" if others else "")
@@ -92,11 +87,11 @@ def _fits(checkpoint: Checkpoint, protocol: Protocol) -> bool:
 
 
 def _wanted(info: ModelInfo, only: Collection[str]) -> bool:
-    return not only or bool({info.name, key(info)} & set(only))
+    return not only or bool({info.name, info.full_name} & set(only))
 
 
 def _check_names(infos: Sequence[ModelInfo], protocol: Protocol, only: Iterable[str]) -> None:
-    keys = [key(info) for info in infos]
+    keys = [info.full_name for info in infos]
     twice = sorted({name for name in keys if keys.count(name) > 1})
     if twice:
         raise EvaluationError(f"there are two models {', '.join(twice)}")

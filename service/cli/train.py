@@ -53,7 +53,7 @@ def register(app: typer.Typer) -> None:
         try:
             begun = None if start is None else load_checkpoint(start)
             if begun is not None:
-                changes["start"] = f"{begun.info.name}@{begun.info.version} ({begun.info.protocol.value})"
+                changes["start"] = f"{begun.info.full_name} ({begun.info.protocol.value})"
             kind, path = parse_data(data)
             source = Source(kind, path, train_split, validation_split, parse_protocol(protocol))
             default = "1.0.0+paper" if source.protocol is Protocol.PAPER else "1.0.0"

@@ -12,7 +12,7 @@ from service.errors import BadField, Overloaded, TrackingUnavailable, UnknownTra
 from service.history.guard import Guard
 from service.history.store import WINDOW, Remembered, StoreError, TrackStore
 from service.history.stores import MAX_WATCHERS
-from service.limits import MAX_ID_LENGTH
+from service.limits import too_long
 
 DEFAULT_WINDOW = 2.0
 """s back from an agent's newest observation."""
@@ -167,5 +167,5 @@ class ConsistencyPlane:
 def _check_id(field: str, value: str) -> None:
     if not value:
         raise BadField(field, "is required")
-    if len(value) > MAX_ID_LENGTH:
-        raise BadField(field, f"has {len(value)} characters; at most {MAX_ID_LENGTH}")
+    if (fault := too_long(value)) is not None:
+        raise BadField(field, fault)

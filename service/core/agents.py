@@ -22,7 +22,7 @@ from model.scene import AgentType
 from service.core.images import decode_layers
 from service.core.options import MAX_POSITION, MAX_TIME
 from service.errors import BadField, Fault
-from service.limits import MAX_ID_LENGTH
+from service.limits import too_long
 from service.settings import Settings
 
 PATCH_PIXELS = 100
@@ -121,8 +121,8 @@ def _head_faults(request: pb.PredictRequest, ids: Sequence[str], settings: Setti
         here = f"agents[{index}]"
         if not agent_id:
             faults[index] = Fault(f"{here}.id", "is required")
-        elif len(agent_id) > MAX_ID_LENGTH:
-            faults[index] = Fault(f"{here}.id", f"has {len(agent_id)} characters; at most {MAX_ID_LENGTH}")
+        elif (fault := too_long(agent_id)) is not None:
+            faults[index] = Fault(f"{here}.id", fault)
         elif uses[agent_id] > 1:
             faults[index] = Fault(f"{here}.id", f"{uses[agent_id]} agents share it")
         elif agent.type == models_pb.AGENT_TYPE_UNSPECIFIED:

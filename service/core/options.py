@@ -10,7 +10,7 @@ from model.forecaster import Context, ModelInfo
 from model.scene import STEP_SECONDS, Raster
 from service.core.images import decode_layers
 from service.errors import BadField, TooLarge
-from service.limits import MAX_ID_LENGTH
+from service.limits import too_long
 from service.settings import Settings
 
 MAX_TIME = 1e10
@@ -67,8 +67,8 @@ def read_options(request: pb.PredictRequest, info: ModelInfo, settings: Settings
     """
     if len(request.agents) > settings.max_agents:
         raise TooLarge(f"{len(request.agents)} agents; at most {settings.max_agents} are accepted")
-    if len(request.scene_id) > MAX_ID_LENGTH:
-        raise BadField("scene_id", f"has {len(request.scene_id)} characters; at most {MAX_ID_LENGTH}")
+    if (fault := too_long(request.scene_id)) is not None:
+        raise BadField("scene_id", fault)
     if not request.HasField("time"):
         raise BadField("time", "is required")
     _check_number("time", request.time, -MAX_TIME, MAX_TIME)

@@ -235,7 +235,7 @@ def _warnings(plan: Plan) -> list[str]:
     warnings = []
     if info.protocol is Protocol.PAPER:
         warnings.append(
-            f"{info.name}@{info.version} was trained by the paper protocol, with derivatives that look into "
+            f"{info.full_name} was trained by the paper protocol, with derivatives that look into "
             "the future; on live states it is less accurate than its published figures"
         )
     scene = plan.scene

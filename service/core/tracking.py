@@ -24,11 +24,6 @@ _SEVERITY = (
 )
 
 
-def series_of(forecaster: Forecaster) -> str:
-    """Under what a model's forecasts are remembered."""
-    return f"{forecaster.info.name}@{forecaster.info.version}"
-
-
 def observed(agents: Agents, models: tuple[Forecaster, Forecaster]) -> list[Sighting]:
     """All that a call says of its agents, before they are forecast.
 
@@ -45,7 +40,7 @@ def observed(agents: Agents, models: tuple[Forecaster, Forecaster]) -> list[Sigh
             agents.ids[index],
             KINDS[kind],
             observations,
-            series_of(forecaster if kind in forecaster.info.agent_types else fallback),
+            (forecaster if kind in forecaster.info.agent_types else fallback).info.full_name,
         )
         for index, kind, observations in zip(agents.valid.tolist(), agents.types, packed, strict=True)
     ]
@@ -80,7 +75,7 @@ def sightings(plan: Plan, results: Sequence[Result], remembered: bool) -> list[S
         for result in results:
             for draft, forecast in zip(result.drafts, pack_forecasts(result.mixture), strict=True):
                 if draft.forecaster is not None:
-                    made[draft.index] = series_of(draft.forecaster), forecast
+                    made[draft.index] = draft.forecaster.info.full_name, forecast
     if agents.observations is None:
         return []
     packed = pack_observations(agents.observations, newest_only=True)

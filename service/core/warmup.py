@@ -32,7 +32,7 @@ async def warm_up(batcher: Batcher, catalog: Catalog, max_batch_agents: int) -> 
     started = time.perf_counter()
     forwards = 0
     for info in catalog.models.infos():
-        forecaster = catalog.get(f"{info.name}@{info.version}")
+        forecaster = catalog.get(info.full_name)
         main = forecaster is catalog.default or forecaster is catalog.fallback
         sizes = _sizes(max_batch_agents) if main else [1]
         for kind in info.agent_types:
