@@ -83,18 +83,26 @@ def reweight(network: AgentNetwork, features: Features, future: Tensor, weights:
 def rubiz(network: AgentNetwork, features: Features, future: Tensor, weights: Weights) -> Loss:
     """RUBiZ: the latents of both contexts, fused, must explain the future, too."""
     full, blind = _both(network, features, future, weights)
-    fused = ContextTerms(
-        full.prior_logits.sigmoid() * blind.prior_logits.sigmoid(),
-        full.posterior_logits.sigmoid() * blind.posterior_logits.sigmoid(),
-        full.step_density,
-        full.displacement,
-    )
+    fused = fused_terms(full, blind)
     bounds = {
         name: _bound(terms, weights) for name, terms in (("full", full), ("blind", blind), ("fused", fused))
     }
     value = bounds["full"].value(RUBIZ_FULL) + bounds["blind"].value() + bounds["fused"].value()
     return Loss(
         value, {key: term for name, bound in bounds.items() for key, term in bound.named(name).items()}
+    )
+
+
+def fused_terms(full: ContextTerms, blind: ContextTerms) -> ContextTerms:
+    """RUBiZ's latents, from both contexts; positions are the full one's.
+
+    Logits are σ(l)·σ(l̃), where, as released, l are normalised ones, log p(z | ·).
+    """
+    return ContextTerms(
+        full.log_prior.sigmoid() * blind.log_prior.sigmoid(),
+        full.log_posterior.sigmoid() * blind.log_posterior.sigmoid(),
+        full.step_density,
+        full.displacement,
     )
 
 
