@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from model.forecaster import Protocol
+from model.training.calibration import Calibration
 from model.training.config import TrainingConfig
 from model.training.state import Progress
 
@@ -29,7 +30,7 @@ def model_card(
     progress: Progress,
     version: str,
     figures: dict[str, float],
-    width: float | None,
+    calibration: Calibration | None,
 ) -> str:
     """Markdown.
 
@@ -39,7 +40,7 @@ def model_card(
         progress: where the run stands; the checkpoint is its best epoch.
         version: of the checkpoint.
         figures: of the best epoch by name.
-        width: factor on the standard deviations that was fitted after training; None: none was.
+        calibration: that was fitted after training; None: none was.
     """
     inputs = {
         Protocol.CAUSAL: "causal: states from the past alone, as a live service has them",
@@ -59,7 +60,7 @@ def model_card(
 - **Training**: best of {progress.epoch} epochs (epoch {progress.best_epoch}; settings ask for
   {config.epochs}), batches of {config.batch_size}, learning rate {config.learning_rate:g},
   seed {config.seed}; {progress.seconds / 60:.0f} minutes on {origin.machine}.
-- **Widths** of the forecasts: {_width(width)}.
+- **Calibration**: {_calibration(calibration)}.
 - **Command**: `{origin.command}`, with the settings below as SETTINGS.toml.
 - **Licence**: {LICENSE}.
 
@@ -80,10 +81,11 @@ mode on this same split.
 """
 
 
-def _width(factor: float | None) -> str:
-    if factor is None:
-        return "as the method has them"
+def _calibration(calibration: Calibration | None) -> str:
+    if calibration is None:
+        return "none, the forecasts are as sure of themselves as the method has them"
     return (
-        f"standard deviations times {factor:.3f}, fitted after training, so that training positions are the "
-        "likeliest; means and probabilities are the network's own"
+        f"standard deviations times {calibration.width:.3f}, logits of the modes divided by "
+        f"{calibration.temperature:.3f}, fitted after training, so that training positions are the "
+        "likeliest; means and the order of the modes are the network's own"
     )

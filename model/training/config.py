@@ -41,8 +41,8 @@ class TrainingConfig(BaseModel):
     history_frames: int = Field(default=5, ge=2)
     epochs: int = Field(default=40, ge=1)
     batch_size: int = Field(default=256, ge=1)
-    fit_widths: bool = True
-    """Whether one factor on a CVAE's standard deviations is fitted after training (``calibration``)."""
+    calibrate: bool = True
+    """Whether a CVAE's widths and the temperature of its modes are fitted after training."""
     adversarial_batch_size: int = Field(default=256, ge=1)
     """Pairs in the batches of HalentNet's adversarial parts; at most ``batch_size``."""
     kl_weight: float = Field(default=100.0, gt=0)
@@ -53,8 +53,9 @@ class TrainingConfig(BaseModel):
     """λ_KL, of CAB alone: how much full and blind latents are pressed apart; as released, 5, beside a
     ``kl_weight`` of 100."""
     displacement_weight: float = Field(default=0.0, ge=0)
-    """1/m, of the distance of the modes from the truth, expected under p(z | x); as released, 0. The
-    likelihood alone leaves it open which mode is the likeliest: this asks that it be a near one."""
+    """1/m, of the distance of the modes (of CoverNet, the members) from the truth, summed over the steps and
+    expected under their probabilities; as released, 0. The likelihood alone leaves it open which mode is the
+    likeliest: this asks that it be a near one."""
     learning_rate: float = Field(gt=0)
     """At the first step; decays by ``learning_rate_decay`` a step, not below ``least_learning_rate``."""
     learning_rate_decay: float = Field(default=0.9999, gt=0, le=1)
@@ -64,6 +65,8 @@ class TrainingConfig(BaseModel):
     averaging: float = Field(default=0.0, ge=0, lt=1)
     """What a step leaves of the running mean of the parameters, e.g. 0.999; the mean is what is judged and
     kept. 0: the parameters themselves are."""
+    dropout: float = Field(default=1.0, ge=0, le=2)
+    """Factor on the networks' dropout rates; as released, 1."""
     precision: Precision = Precision.BFLOAT16
     """Of convolutions and decoder in training."""
     start: str | None = None

@@ -18,7 +18,7 @@ from model.data.sources import READERS
 from model.forecaster import ModelInfo, Protocol
 from model.scene import AgentType
 from model.training import processes
-from model.training.calibration import fit_width, widen
+from model.training.calibration import calibrate, fit_calibration
 from model.training.card import LICENSE, Origin, model_card
 from model.training.config import TrainingConfig
 from model.training.logs import RunLog
@@ -140,11 +140,11 @@ class Run:
         config, network = self.config, trainer.networks.config
         trainer.networks.load_state_dict(trainer.best())
         trainer.networks.eval()
-        width = None
-        if config.fit_widths and isinstance(trainer.networks, CvaeNetworks):
+        calibration = None
+        if config.calibrate and isinstance(trainer.networks, CvaeNetworks):
             vehicles = trainer.networks.of(AgentType.VEHICLE)
-            width = fit_width(vehicles, train)
-            widen(vehicles, width)
+            calibration = fit_calibration(vehicles, train)
+            calibrate(vehicles, calibration)
         figures = validation.judge(trainer.networks, samples=SAMPLES, draws=DRAWS)
         begun = "" if config.start is None else f"; begun with {config.start}"
         info = ModelInfo(
@@ -164,7 +164,7 @@ class Run:
             license=LICENSE,
         )
         tensors = {name: tensor.cpu() for name, tensor in trainer.networks.state_dict().items()}
-        card = model_card(config, origin, trainer.progress, self.version, figures, width)
+        card = model_card(config, origin, trainer.progress, self.version, figures, calibration)
         folder = self.out / "checkpoint"
         save_checkpoint(folder, info, network, tensors, card)
         load_checkpoint(folder).forecaster()  # what cannot be read again is no checkpoint

@@ -1,55 +1,76 @@
-"""The width of forecasts, fitted after training."""
+"""How sure forecasts are of themselves, fitted after training."""
 
 import pytest
 import torch
 from torch import Tensor
 
 from model.forecaster import Context, Features
+from model.mixture import TrajectoryMixture
 from model.networks.config import NetworkConfig
 from model.networks.network import AgentNetwork
 from model.scene import AgentType
-from model.training.calibration import fit_width, widen
+from model.training.calibration import Calibration, calibrate, fit_calibration
 from tests.model.training.fakes import MadeUpPairs
 
 
 @pytest.fixture
 def network() -> AgentNetwork:
+    """One whose modes differ, in where they lead and in how likely they are."""
     torch.manual_seed(0)
-    return AgentNetwork(NetworkConfig(modes=5), AgentType.VEHICLE).eval()
+    modes = 5
+    network = AgentNetwork(NetworkConfig(modes=modes), AgentType.VEHICLE).eval()
+    with torch.no_grad():
+        network.prior_logits.weight.mul_(30)
+        network.full.decoder.initial_h.weight[:, :modes].mul_(30)
+        network.full.decoder.cell.weight_ih[:, :modes].mul_(10)
+        network.full.decoder.log_sigma.bias.sub_(2)
+    return network
 
 
 class Drawn(MadeUpPairs):
-    """Pairs whose truth is drawn from a network's own forecasts, made wider."""
+    """Pairs whose truth is drawn from a network's own forecasts, calibrated otherwise."""
 
-    def __init__(self, pairs: int, network: AgentNetwork, factor: float) -> None:
+    def __init__(self, pairs: int, network: AgentNetwork, calibration: Calibration) -> None:
         super().__init__(pairs)
         with torch.no_grad():
             log_weights, positions = network(self._features, Context.FULL, 12)
         generator = torch.Generator().manual_seed(1)
         rows = torch.arange(pairs)[:, None]
         # A mode a step: the figure that is fitted is that of single steps
-        mode = torch.multinomial(log_weights.exp(), 12, replacement=True, generator=generator)
+        shares = (log_weights / calibration.temperature).softmax(dim=1)
+        mode = torch.multinomial(shares, 12, replacement=True, generator=generator)
         steps = torch.arange(12)[None]
         scale = torch.linalg.cholesky(positions.covariance[rows, mode, steps] + 1e-6 * torch.eye(2))
         noise = torch.randn(pairs, 12, 2, 1, generator=generator)
-        self._future = positions.mean[rows, mode, steps] + factor * (scale @ noise)[..., 0]
+        self._future = positions.mean[rows, mode, steps] + calibration.width * (scale @ noise)[..., 0]
 
     def batch(self, indices: Tensor, turns: Tensor | None = None) -> tuple[Features, Tensor]:
         features, _ = super().batch(indices, turns)
         return features, self._future[indices]
 
 
-@pytest.mark.parametrize("factor", [0.5, 1.0, 3.0])
-def test_the_width_that_the_truth_has_is_found(network: AgentNetwork, factor: float) -> None:
-    assert fit_width(network, Drawn(300, network, factor)) == pytest.approx(factor, rel=0.1)
+@pytest.mark.parametrize("width", [0.5, 1.0, 3.0])
+@pytest.mark.parametrize("temperature", [0.5, 1.0, 2.5])
+def test_what_the_truth_was_drawn_with_is_found(
+    network: AgentNetwork, width: float, temperature: float
+) -> None:
+    found = fit_calibration(network, Drawn(600, network, Calibration(width, temperature)))
+    assert found.width == pytest.approx(width, rel=0.1)
+    assert found.temperature == pytest.approx(temperature, rel=0.15)
 
 
-def test_widening_changes_covariances_and_nothing_else(network: AgentNetwork) -> None:
+def test_what_is_built_in_is_what_was_fitted(network: AgentNetwork) -> None:
+    """Covariances and probabilities change as the calibration says; means, and the modes' order, do not."""
     features, _ = MadeUpPairs(6).batch(torch.arange(6))
+    calibration = Calibration(width=1.7, temperature=3.0)
+    origin = torch.zeros(6, 2, dtype=torch.float64)
     with torch.no_grad():
         weights, positions = network(features, Context.FULL, 12)
-        widen(network, 1.7)
+        expected = calibration.of(TrajectoryMixture(weights, positions.mean, positions.covariance, origin))
+        calibrate(network, calibration)
         weights_after, after = network(features, Context.FULL, 12)
-    assert torch.equal(weights, weights_after)
     assert torch.equal(positions.mean, after.mean)
-    assert torch.allclose(after.covariance, 1.7**2 * positions.covariance, rtol=1e-4, atol=1e-6)
+    assert torch.equal(weights.argsort(1), weights_after.argsort(1))
+    assert not torch.allclose(weights, weights_after)
+    torch.testing.assert_close(weights_after, expected.log_weights)
+    torch.testing.assert_close(after.covariance, expected.covariances, rtol=1e-4, atol=1e-6)
