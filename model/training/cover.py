@@ -134,10 +134,20 @@ def nearest_member(paths: Tensor, members: Tensor) -> Tensor:
         paths: [N, T, 2], m, in the agents' own frames.
         members: [M, T, 2], on the same device.
     """
+    return summed_distances(paths, members).argmin(dim=1)
+
+
+def summed_distances(paths: Tensor, members: Tensor) -> Tensor:
+    """Distances of every path from every member, summed over the steps: [N, M], m.
+
+    Args:
+        paths: [N, T, 2], m, in the agents' own frames.
+        members: [M, T, 2], on the same device.
+    """
     total = torch.zeros(len(paths), len(members), device=paths.device)
     for distance in _step_distances(paths, members):
         total += distance
-    return total.argmin(dim=1)
+    return total
 
 
 def _step_distances(paths: Tensor, members: Tensor) -> Iterator[Tensor]:

@@ -13,6 +13,7 @@ from model.network_forecaster import Networks
 from model.networks.config import NetworkConfig
 from model.scene import AgentType
 from model.training.config import TrainingConfig
+from model.training.dropout import scale_dropout
 from model.training.objectives import OBJECTIVES, Loss, Weights
 from model.training.precision import set_precision
 from model.training.processes import average_gradients
@@ -80,6 +81,7 @@ class DescentLearner(Learner):
     def __init__(self, config: TrainingConfig, networks: Networks[Any]) -> None:
         super().__init__(networks)
         set_precision(networks, config.precision)
+        scale_dropout(networks, config.dropout)
         self.optimizer = torch.optim.Adam(self._groups(), lr=config.learning_rate)
         self._clip = config.gradient_clip
         self._batch_size = config.batch_size

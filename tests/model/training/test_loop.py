@@ -5,13 +5,16 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from model.cvae import CvaeNetworks
 from model.forecaster import Context
 from model.network_forecaster import Networks
+from model.networks.config import NetworkConfig
 from model.networks.covernet import CoverNet
 from model.scene import AgentType
 from model.training.config import Method, TrainingConfig, TrainingError, load_config
+from model.training.dropout import scale_dropout
 from model.training.loop import SCORE, Trainer
 from model.training.state import Progress
 from tests.model.training.fakes import MadeUpPairs, small_config
@@ -102,6 +105,29 @@ def test_the_running_mean_is_resumed_exactly(tmp_path: Path) -> None:
     parts, _ = train(config(2), tmp_path / "parts")
     assert parts.progress.best_score == whole.progress.best_score
     assert all(torch.equal(tensor, parts.best()[name]) for name, tensor in whole.best().items())
+
+
+@pytest.mark.parametrize("factor", [0.0, 0.5, 1.0])
+def test_dropout_is_scaled_in_every_network_of_a_run(tmp_path: Path, factor: float) -> None:
+    def rates(networks: nn.Module) -> list[float]:
+        return [module.p for module in networks.modules() if isinstance(module, nn.Dropout)]
+
+    config = small_config(Method.CAB, dropout=factor, averaging=0.9)
+    networks = Trainer(config, PAIRS, validate, tmp_path, torch.device("cpu")).networks
+    assert isinstance(config.network, NetworkConfig)
+    released = rates(CvaeNetworks(config.network))
+    assert len(released) == 5
+    assert min(released) > 0
+    assert rates(networks) == [rate * factor for rate in released]
+
+
+def test_without_dropout_a_step_is_the_same_each_time() -> None:
+    networks = CvaeNetworks(NetworkConfig()).train()
+    network, (given, _) = networks.of(AgentType.VEHICLE), PAIRS.batch(torch.arange(8))
+    with torch.no_grad():
+        assert not torch.equal(*(network.encode(given, Context.FULL) for _ in range(2)))
+        scale_dropout(networks, 0.0)
+        assert torch.equal(*(network.encode(given, Context.FULL) for _ in range(2)))
 
 
 def test_a_run_begins_with_the_parameters_that_it_is_given(tmp_path: Path) -> None:
