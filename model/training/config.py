@@ -75,6 +75,8 @@ class TrainingConfig(BaseModel):
     """Bound of the gradient's norm."""
     rotate: bool = True
     """Turn each agent's surroundings by a random multiple of 15° (the map patch is agent-aligned)."""
+    mirror: bool = False
+    """Exchange left and right around every other agent, at random; as released, no."""
     curved_copies: int = Field(default=2, ge=1)
     """How often an epoch shows a pair whose path is curved."""
     seed: int = 0

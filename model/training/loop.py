@@ -11,6 +11,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
+from model.data.mirroring import mirror
 from model.network_forecaster import Networks
 from model.training import processes
 from model.training.annealing import ANNEALED, KL_SHARE, Z_LOGIT_CLIP, cooldown, learning_rate
@@ -18,7 +19,7 @@ from model.training.config import TrainingConfig, TrainingError
 from model.training.learner import Batch
 from model.training.learners import make_learner
 from model.training.objectives import Weights
-from model.training.sampling import epoch_order, epoch_seed, random_turns
+from model.training.sampling import epoch_order, epoch_seed, random_sides, random_turns
 from model.training.source import BatchSource
 from model.training.state import Progress, load_state, save_state
 
@@ -151,8 +152,10 @@ class Trainer:
         start = number * self.config.batch_size
         indices = order[start : start + size]
         turns = random_turns(len(indices), generator) if self.config.rotate else None
+        sides = random_sides(len(indices), generator) if self.config.mirror else None
         mine = slice(processes.rank(), None, processes.world())
-        return Batch(*self._train.batch(indices[mine], None if turns is None else turns[mine]))
+        batch = Batch(*self._train.batch(indices[mine], None if turns is None else turns[mine]))
+        return batch if sides is None else Batch(*mirror(*batch, sides[mine].to(self._device)))
 
     def _step(self, batches: Sequence[Batch]) -> dict[str, Tensor]:
         step = self.progress.step

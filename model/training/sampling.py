@@ -30,6 +30,11 @@ def random_turns(count: int, generator: torch.Generator) -> Tensor:
     return torch.randint(0, 24, (count,), generator=generator) * (torch.pi / 12)
 
 
+def random_sides(count: int, generator: torch.Generator) -> Tensor:
+    """[count] bool, each true as often as not."""
+    return torch.rand(count, generator=generator) < 0.5
+
+
 def epoch_seed(seed: int, epoch: int) -> int:
     """A seed for one epoch: what is random in it does not hang on the epochs before, so that a resumed
     run goes on exactly as an unbroken one."""

@@ -1,0 +1,49 @@
+"""Augmentation by reflection: left and right exchanged, as between traffic on either side of the road."""
+
+import torch
+from torch import Tensor
+
+from model.forecaster import Features
+from model.standardization import HEADING
+
+_NEIGHBORS = "neighbors."
+_SIDEWAYS = (1, 3, 5, HEADING, HEADING + 1)
+"""Of a state: y, its velocity and acceleration; of a vehicle also heading and heading rate."""
+_BOX_SIDEWAYS = (1, 2)
+"""Of a box: left of the agent, heading."""
+
+
+def mirror(features: Features, future: Tensor, chosen: Tensor) -> tuple[Features, Tensor]:
+    """Features as they were had the scenes of some agents been reflected, y for −y.
+
+    The map patch, which lies in the agent's frame, has its columns exchanged about that of the agent; the
+    first, to the far right, for which there is none on the left, repeats the one beside it.
+
+    Args:
+        features: of n vehicles, from ``scene_features`` or ``Batches``; left as they are.
+        future: [n, T, 2], relative to the position now.
+        chosen: [n] bool, which of them.
+
+    Returns:
+        New features, and the new future.
+    """
+    sign = torch.where(chosen, -1.0, 1.0)
+    mirrored = dict(features)
+    for name, values in features.items():
+        if name in {"history", "velocity"} or name.startswith(_NEIGHBORS):
+            mirrored[name] = _flip(values, _SIDEWAYS, sign)
+    if "surroundings" in features:
+        mirrored["surroundings"] = _flip(features["surroundings"], _BOX_SIDEWAYS, sign)
+    if "map" in features:
+        turned = features["map"].flip(-1)
+        turned = torch.cat([turned[..., :1], turned[..., :-1]], dim=-1)
+        mirrored["map"] = torch.where(chosen[:, None, None, None], turned, features["map"])
+    return mirrored, _flip(future, _SIDEWAYS, sign)
+
+
+def _flip(values: Tensor, columns: tuple[int, ...], sign: Tensor) -> Tensor:
+    """[n, …, D], those of the columns that there are times each agent's sign."""
+    there = [column for column in columns if column < values.shape[-1]]
+    flipped = values.clone()
+    flipped[..., there] *= sign.to(values.dtype).view(-1, *[1] * (values.dim() - 1))
+    return flipped

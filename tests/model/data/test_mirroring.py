@@ -1,0 +1,98 @@
+"""Augmentation by reflection."""
+
+import numpy as np
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from model.data.mirroring import mirror
+from model.data.protocols import frame_scene
+from model.data.scenes import SceneRecord, Track
+from model.features import scene_features
+from model.forecaster import Context, Features, Protocol
+from model.networks.config import NetworkConfig
+from model.networks.drawing import draw_boxes
+from model.scene import AgentType, Raster
+from model.standardization import HEADING
+from model.surroundings import surroundings
+from tests.model.data.records import record
+
+CONFIG = NetworkConfig()
+VEHICLE = AgentType.VEHICLE
+
+
+def reflected(scene: SceneRecord) -> SceneRecord:
+    """The record with y for −y, its raster too."""
+    tracks = [
+        Track(one.id, one.type, one.frames, one.position * np.array([1.0, -1.0]), -one.heading)
+        for one in scene.tracks
+    ]
+    given = scene.raster
+    last = given.origin[1] + (given.layers.shape[2] - 1) / given.pixels_per_meter
+    layers = np.ascontiguousarray(given.layers[:, :, ::-1])
+    origin = np.array([given.origin[0], -last])
+    return SceneRecord(scene.name, tracks, scene.pairs, Raster(layers, origin, given.pixels_per_meter))
+
+
+def of(whole: SceneRecord, frame: int, index: int, protocol: Protocol) -> tuple[Features, torch.Tensor]:
+    """Features of a track at a frame, boxes of the agents around among them, and its future."""
+    scene, tracks = frame_scene(whole, frame, protocol, 5)
+    target = np.flatnonzero(tracks == index)
+    features = scene_features(scene, target, VEHICLE, CONFIG, Context.FULL)
+    features["surroundings"] = torch.from_numpy(surroundings(scene, target, CONFIG.neighbor_types))
+    one = whole.tracks[index]
+    now = one.frames.tolist().index(frame)
+    future = one.position[now + 1 : now + 13] - one.position[now]
+    return features, torch.from_numpy(future)[None].float()
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    seed=st.integers(0, 5),
+    frame=st.integers(1, 11),
+    index=st.integers(0, 3),
+    protocol=st.sampled_from(Protocol),
+)
+def test_mirroring_features_is_mirroring_the_scene(
+    seed: int, frame: int, index: int, protocol: Protocol
+) -> None:
+    whole = record(seed=seed)
+    one = whole.tracks[index]
+    if frame not in one.frames or frame == one.frames[0]:
+        return
+    given_features, future = of(whole, frame, index, protocol)
+    before = {name: value.clone() for name, value in given_features.items()}
+    got, got_future = mirror(given_features, future, torch.tensor([True]))
+    wanted, wanted_future = of(reflected(whole), frame, index, protocol)
+    assert got.keys() == wanted.keys()
+    torch.testing.assert_close(got_future, wanted_future, rtol=0, atol=1e-4)
+    # The agent is elsewhere, and in the patch there is no column to the far right's left
+    for name in got.keys() - {"origin", "map"}:
+        np.testing.assert_allclose(got[name], wanted[name], rtol=1e-4, atol=2e-5, err_msg=name)
+        assert got[name].dtype == wanted[name].dtype
+    off = (got["map"] - wanted["map"])[..., 1:].abs()
+    # Raster pixels lie on the same points up to rounding: an edge may fall to its other side
+    assert off.mean() < 1e-3
+    drawn = draw_boxes(got["surroundings"]) - draw_boxes(wanted["surroundings"])
+    assert drawn.abs().max() < 1e-3
+    for name, value in before.items():
+        assert torch.equal(given_features[name], value)
+
+
+def test_only_the_chosen_are_mirrored_and_twice_is_not_at_all() -> None:
+    parts = [of(record(seed=2), 9, index, Protocol.CAUSAL) for index in range(4)]
+    features = {name: torch.cat([part[name] for part, _ in parts]) for name in parts[0][0]}
+    future = torch.cat([one for _, one in parts])
+    chosen = torch.tensor([True, False, True, False])
+    once, once_future = mirror(features, future, chosen)
+    twice, twice_future = mirror(once, once_future, chosen)
+    assert torch.equal(once_future[~chosen], future[~chosen])
+    assert not torch.equal(once_future[chosen], future[chosen])
+    assert torch.equal(twice_future, future)
+    for name, value in features.items():
+        assert torch.equal(once[name][~chosen], value[~chosen]), name
+        if name == "map":
+            assert torch.equal(twice[name][..., 1:], value[..., 1:])
+        else:
+            assert torch.equal(twice[name], value), name
+    assert not torch.equal(once["history"][chosen][..., HEADING], features["history"][chosen][..., HEADING])
