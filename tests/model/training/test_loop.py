@@ -1,5 +1,6 @@
 """The loop: learns, resumes exactly, keeps the best."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,10 @@ from model.networks.covernet import CoverNet
 from model.scene import AgentType
 from model.training.config import Method, TrainingConfig, TrainingError, load_config
 from model.training.dropout import scale_dropout
+from model.training.learner import Batch
 from model.training.loop import SCORE, Trainer
+from model.training.objectives import Weights
+from model.training.sampling import epoch_order
 from model.training.state import Progress
 from tests.model.training.fakes import MadeUpPairs, small_config
 
@@ -58,9 +62,9 @@ def test_every_method_learns(tmp_path: Path, method: Method) -> None:
 
 @pytest.mark.parametrize("method", [Method.CAB, Method.COVERNET, Method.HALENTNET])
 def test_a_run_in_two_parts_is_the_same_as_in_one(tmp_path: Path, method: Method) -> None:
-    whole, _ = train(small_config(method, epochs=2), tmp_path / "whole")
-    train(small_config(method, epochs=1), tmp_path / "parts")
-    parts, reports = train(small_config(method, epochs=2), tmp_path / "parts")
+    whole, _ = train(small_config(method, epochs=2, mirror=True), tmp_path / "whole")
+    train(small_config(method, epochs=1, mirror=True), tmp_path / "parts")
+    parts, reports = train(small_config(method, epochs=2, mirror=True), tmp_path / "parts")
     assert len(reports) == 1
     assert parts.progress.step == whole.progress.step
     assert parts.progress.best_score == whole.progress.best_score
@@ -128,6 +132,34 @@ def test_without_dropout_a_step_is_the_same_each_time() -> None:
         assert not torch.equal(*(network.encode(given, Context.FULL) for _ in range(2)))
         scale_dropout(networks, 0.0)
         assert torch.equal(*(network.encode(given, Context.FULL) for _ in range(2)))
+
+
+@pytest.mark.parametrize("asked", [False, True])
+def test_about_half_of_the_agents_are_mirrored_if_asked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, asked: bool
+) -> None:
+    config = small_config(Method.TRAJECTRON, epochs=1, mirror=asked, rotate=False)
+    trainer = Trainer(config, PAIRS, validate, tmp_path, torch.device("cpu"))
+    seen: list[Batch] = []
+    step = trainer.learner.step
+
+    def watch(batches: Sequence[Batch], weights: Weights, rate: float) -> dict[str, Tensor]:
+        seen.extend(batches)
+        return step(batches, weights, rate)
+
+    monkeypatch.setattr(trainer.learner, "step", watch)
+    trainer.run(lambda progress, figures: None, lambda done, batches: None)
+    known, future = PAIRS.batch(epoch_order(PAIRS.turned, config.curved_copies, config.seed, epoch=0))
+    got = torch.cat([batch.future for batch in seen])
+    expected, velocity = future[: len(got)], known["velocity"][: len(got)]
+    mirrored = (got[..., 1] == -expected[..., 1]).all(dim=1)
+    kept = (got == expected).all(dim=2).all(dim=1)
+    assert (mirrored ^ kept).all()
+    assert 0.25 < mirrored.double().mean() < 0.75 if asked else kept.all()
+    sides = torch.where(mirrored, -1.0, 1.0)
+    assert torch.equal(
+        torch.cat([batch.features["velocity"][:, 1] for batch in seen]), sides * velocity[:, 1]
+    )
 
 
 def test_a_run_begins_with_the_parameters_that_it_is_given(tmp_path: Path) -> None:
