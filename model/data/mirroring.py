@@ -3,10 +3,10 @@
 import torch
 from torch import Tensor
 
+from model.data.rotation import NEIGHBORS
 from model.forecaster import Features
 from model.standardization import HEADING
 
-_NEIGHBORS = "neighbors."
 _SIDEWAYS = (1, 3, 5, HEADING, HEADING + 1)
 """Of a state: y, its velocity and acceleration; of a vehicle also heading and heading rate."""
 _BOX_SIDEWAYS = (1, 2)
@@ -30,7 +30,7 @@ def mirror(features: Features, future: Tensor, chosen: Tensor) -> tuple[Features
     sign = torch.where(chosen, -1.0, 1.0)
     mirrored = dict(features)
     for name, values in features.items():
-        if name in {"history", "velocity"} or name.startswith(_NEIGHBORS):
+        if name in {"history", "velocity"} or name.startswith(NEIGHBORS):
             mirrored[name] = _flip(values, _SIDEWAYS, sign)
     if "surroundings" in features:
         mirrored["surroundings"] = _flip(features["surroundings"], _BOX_SIDEWAYS, sign)

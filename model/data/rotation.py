@@ -8,7 +8,8 @@ from torch import Tensor
 from model.forecaster import Features
 from model.standardization import HEADING
 
-_NEIGHBORS = "neighbors."
+NEIGHBORS = "neighbors."
+"""Features whose names begin so are states of neighbours."""
 
 
 def rotate(features: Features, future: Tensor, angle: Tensor) -> tuple[Features, Tensor]:
@@ -37,7 +38,7 @@ def rotate(features: Features, future: Tensor, angle: Tensor) -> tuple[Features,
     turned["history"] = history
     turned["velocity"] = _turn(features["velocity"], matrix)
     for name, states in features.items():
-        if name.startswith(_NEIGHBORS):  # their headings are relative to the own
+        if name.startswith(NEIGHBORS):  # their headings are relative to the own
             turned[name] = _turn_states(states, matrix)
     return turned, _turn(future, matrix)
 

@@ -10,7 +10,7 @@ have longer tails than Gaussians.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Final, NamedTuple
 
@@ -26,12 +26,12 @@ from model.training.source import BatchSource
 
 PAIRS: Final = 2048
 """That the numbers are fitted to, spread over the split."""
-LEAST, MOST = 0.1, 16.0
-"""Bounds of either number."""
+LEAST, MOST = 0.1, 100.0
+"""Bounds of the numbers."""
 _BATCH: Final = 256
 _TURNS: Final = 3
 """How often each number is fitted with the other one held."""
-_ROUNDS: Final = 16
+_ROUNDS: Final = 18
 _GOLDEN: Final = (math.sqrt(5) - 1) / 2
 
 
@@ -42,9 +42,12 @@ class Calibration(NamedTuple):
     """Factor on the standard deviations."""
     temperature: float
     """Divisor of the logits of p(z | x): above 1 the modes' probabilities come nearer to each other."""
+    blind_width: float | None = None
+    """Factor on the standard deviations of blind forecasts, where the network has a branch of its own for
+    them; what comes last in p(z | x) is one for both."""
 
     def of(self, mixture: TrajectoryMixture) -> TrajectoryMixture:
-        """The forecasts with it."""
+        """Forecasts of full context with it."""
         return TrajectoryMixture(
             F.log_softmax(mixture.log_weights / self.temperature, dim=1),
             mixture.means,
@@ -61,17 +64,16 @@ def fit_calibration(network: AgentNetwork, pairs: BatchSource) -> Calibration:
         network: in evaluation mode.
         pairs: that it was trained on.
     """
-    judged = _forecasts(network, pairs)
-
-    def unlikely(width: float, temperature: float) -> float:
-        calibration = Calibration(width, temperature)
-        return sum(float(nll(calibration.of(m), truth, LABEL_NOISE_M).sum()) for m, truth in judged)
-
+    judged = _forecasts(network, pairs, Context.FULL)
     width, temperature = 1.0, 1.0
     for _ in range(_TURNS):
-        width = _least(partial(unlikely, temperature=temperature))
-        temperature = _least(partial(unlikely, width))
-    return Calibration(width, temperature)
+        width = _least(partial(_unlikely, judged, temperature=temperature))
+        if network.config.modes > 1:
+            temperature = _least(partial(_unlikely, judged, width))
+    if network.blind is None:
+        return Calibration(width, temperature)
+    blind = _forecasts(network, pairs, Context.BLIND)
+    return Calibration(width, temperature, _least(partial(_unlikely, blind, temperature=temperature)))
 
 
 @torch.no_grad()
@@ -79,21 +81,31 @@ def calibrate(network: AgentNetwork, calibration: Calibration) -> None:
     """Builds it into a network's parameters.
 
     Positions' covariances are linear in those of the controls (``model.networks.dynamics``), and only means
-    are fed back in prediction: so the bias of the full context's heads is all that changes of them. The last
-    layer of p(z | x) is one for all contexts.
+    are fed back in prediction: so the bias of the heads is all that changes of them.
     """
     network.full.decoder.log_sigma.bias.add_(math.log(calibration.width))
+    if network.blind is not None and calibration.blind_width is not None:
+        network.blind.decoder.log_sigma.bias.add_(math.log(calibration.blind_width))
     network.prior_logits.weight.div_(calibration.temperature)
     network.prior_logits.bias.div_(calibration.temperature)
 
 
-def _forecasts(network: AgentNetwork, pairs: BatchSource) -> list[tuple[TrajectoryMixture, Floats]]:
-    """With full context, and where the agents went: [N, T, 2], m, ground frame."""
+_Judged = Sequence[tuple[TrajectoryMixture, Floats]]
+"""Forecasts, and where the agents went: [N, T, 2], m, ground frame."""
+
+
+def _unlikely(judged: _Judged, width: float, temperature: float) -> float:
+    """Negative log-likelihood of all steps, calibrated so."""
+    calibration = Calibration(width, temperature)
+    return sum(float(nll(calibration.of(mixture), truth, LABEL_NOISE_M).sum()) for mixture, truth in judged)
+
+
+def _forecasts(network: AgentNetwork, pairs: BatchSource, context: Context) -> _Judged:
     chosen = torch.linspace(0, len(pairs) - 1, min(PAIRS, len(pairs))).long().unique()
     judged = []
     for indices in chosen.split(_BATCH):
         features, future = pairs.batch(indices)
-        log_weights, positions = network(features, Context.FULL, future.shape[1])
+        log_weights, positions = network(features, context, future.shape[1])
         parts = (log_weights, positions.mean, positions.covariance, features["origin"])
         truth = (future.double() + features["origin"][:, None]).cpu().numpy()
         judged.append((TrajectoryMixture(*(part.cpu() for part in parts)), truth))

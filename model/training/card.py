@@ -84,8 +84,11 @@ mode on this same split.
 def _calibration(calibration: Calibration | None) -> str:
     if calibration is None:
         return "none, the forecasts are as sure of themselves as the method has them"
+    blind = calibration.blind_width
+    of_blind = "" if blind is None else f" (of blind forecasts {blind:.3f})"
     return (
-        f"standard deviations times {calibration.width:.3f}, logits of the modes divided by "
+        f"standard deviations times {calibration.width:.3f}{of_blind}, logits of the modes divided by "
         f"{calibration.temperature:.3f}, fitted after training, so that training positions are the "
-        "likeliest; means and the order of the modes are the network's own"
+        "likeliest. Means and the order of the modes are the network's own; their probabilities are nearer "
+        "to each other than it had learned them where the divisor is above 1"
     )

@@ -65,8 +65,8 @@ class TrainingConfig(BaseModel):
     averaging: float = Field(default=0.0, ge=0, lt=1)
     """What a step leaves of the running mean of the parameters, e.g. 0.999; the mean is what is judged and
     kept. 0: the parameters themselves are."""
-    dropout: float = Field(default=1.0, ge=0, le=2)
-    """Factor on the networks' dropout rates; as released, 1."""
+    dropout_factor: float = Field(default=1.0, ge=0, lt=2)
+    """On the networks' dropout rates; as released, 1."""
     precision: Precision = Precision.BFLOAT16
     """Of convolutions and decoder in training."""
     start: str | None = None
@@ -85,6 +85,12 @@ class TrainingConfig(BaseModel):
     def _network_fits_method(self) -> "TrainingConfig":
         if isinstance(self.network, CoverNetConfig) is not (self.method is Method.COVERNET):
             raise ValueError(f"a network of kind {self.network.kind} does not learn by {self.method.value}")
+        return self
+
+    @model_validator(mode="after")
+    def _mirrors_what_is_covered(self) -> "TrainingConfig":
+        if self.mirror and self.method is Method.COVERNET:
+            raise ValueError("mirror: covernet's set of trajectories does not cover mirrored ones")
         return self
 
     @model_validator(mode="after")

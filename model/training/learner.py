@@ -81,7 +81,7 @@ class DescentLearner(Learner):
     def __init__(self, config: TrainingConfig, networks: Networks[Any]) -> None:
         super().__init__(networks)
         set_precision(networks, config.precision)
-        scale_dropout(networks, config.dropout)
+        scale_dropout(networks, config.dropout_factor)
         self.optimizer = torch.optim.Adam(self._groups(), lr=config.learning_rate)
         self._clip = config.gradient_clip
         self._batch_size = config.batch_size

@@ -1,6 +1,7 @@
-"""The dynamics as the released code computes them: float32, step by step, closed forms, map coordinates.
+"""The unicycle of Trajectron++ (Salzmann et al. 2020, section 4.2 and appendix) in the arithmetic of its
+published code: float32, step by step, closed forms, map coordinates.
 
-They divide by powers of the heading rate, down to 0.01 rad/s, and cancel; so their last bits come out
+These divide by powers of the heading rate, down to 0.01 rad/s, and cancel; so their last bits come out
 multiplied by up to 1e4. To compare with what was computed so, one has to know how far rounding moves it:
 ``Released`` can be told to round every intermediate result a little differently.
 """

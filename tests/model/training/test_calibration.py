@@ -1,12 +1,14 @@
 """How sure forecasts are of themselves, fitted after training."""
 
+import copy
+
 import pytest
 import torch
 from torch import Tensor
 
 from model.forecaster import Context, Features
 from model.mixture import TrajectoryMixture
-from model.networks.config import NetworkConfig
+from model.networks.config import BlindContext, NetworkConfig
 from model.networks.network import AgentNetwork
 from model.scene import AgentType
 from model.training.calibration import Calibration, calibrate, fit_calibration
@@ -59,16 +61,34 @@ def test_what_the_truth_was_drawn_with_is_found(
     assert found.temperature == pytest.approx(temperature, rel=0.15)
 
 
-def test_what_is_built_in_is_what_was_fitted(network: AgentNetwork) -> None:
+def test_one_mode_has_no_temperature() -> None:
+    network = AgentNetwork(NetworkConfig(modes=1), AgentType.VEHICLE).eval()
+    assert fit_calibration(network, MadeUpPairs(6)).temperature == 1.0
+
+
+@pytest.mark.parametrize("kind", BlindContext)
+def test_what_is_built_in_is_what_was_fitted(kind: BlindContext) -> None:
     """Covariances and probabilities change as the calibration says; means, and the modes' order, do not."""
+    torch.manual_seed(0)
+    network = AgentNetwork(NetworkConfig(modes=5, blind=kind), AgentType.VEHICLE).eval()
+    contexts = (Context.FULL,) if kind is BlindContext.NONE else tuple(Context)
+    for context in contexts:
+        check_built_in(copy.deepcopy(network), context)
+
+
+def check_built_in(network: AgentNetwork, context: Context) -> None:
+    """By what a network says in a context before and after."""
+    blind_width = 0.4
+    calibration = Calibration(width=1.7, temperature=3.0, blind_width=blind_width)
     features, _ = MadeUpPairs(6).batch(torch.arange(6))
-    calibration = Calibration(width=1.7, temperature=3.0)
     origin = torch.zeros(6, 2, dtype=torch.float64)
     with torch.no_grad():
-        weights, positions = network(features, Context.FULL, 12)
-        expected = calibration.of(TrajectoryMixture(weights, positions.mean, positions.covariance, origin))
+        weights, positions = network(features, context, 12)
+        own_branch = context is Context.BLIND and network.blind is not None
+        shown = calibration._replace(width=blind_width) if own_branch else calibration
+        expected = shown.of(TrajectoryMixture(weights, positions.mean, positions.covariance, origin))
         calibrate(network, calibration)
-        weights_after, after = network(features, Context.FULL, 12)
+        weights_after, after = network(features, context, 12)
     assert torch.equal(positions.mean, after.mean)
     assert torch.equal(weights.argsort(1), weights_after.argsort(1))
     assert not torch.allclose(weights, weights_after)

@@ -74,6 +74,8 @@ TERMS = {
 """Our terms by the golden files' names."""
 WITHIN_ONE_PERCENT = {"trajectron": 0.85, "cab": 0.95, "reweight": 0.8, "rubiz": 0.8}
 """Share of the gradients, at least."""
+NEXT_TO_NOTHING = 3e-3
+"""Of the greatest gradient's norm."""
 
 
 class Golden(NamedTuple):
@@ -162,10 +164,10 @@ def test_gradients_reach_what_they_reach_in_the_reference(golden: Golden) -> Non
 
 
 def test_gradient_norms(golden: Golden, released: Released) -> None:
-    """To 1 %, or as near as the reference's own rounding lets one tell.
+    """To 1 %, or as near as the reference's own rounding lets one tell, up to 10 %.
 
     How far that moves each norm is measured: in eight runs every intermediate result of the integration is
-    rounded anew.
+    rounded anew. Gradients of next to nothing, which are what cancellation left over, may be off by more.
     """
     ours = golden.ratios()
     released.rounding = FLOAT32_ROUNDING
@@ -174,7 +176,9 @@ def test_gradient_norms(golden: Golden, released: Released) -> None:
     spread = np.ptp(runs, axis=0)
     off = np.abs(ours - 1)
     names = np.array(list(golden.norms))
-    assert not names[off > np.maximum(0.01, spread)].tolist()
+    norms = np.array(list(golden.norms.values()))
+    most = np.where(norms > NEXT_TO_NOTHING * norms.max(), 0.1, np.inf)
+    assert not names[off > np.maximum(0.01, np.minimum(spread, most))].tolist()
     # With random weights a vehicle's degenerate covariances can make half of a gradient; that must stay rare
     assert (off < 0.01).mean() >= WITHIN_ONE_PERCENT[golden.method]
 

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from safetensors.torch import load_file
 
 from model.checkpoint import load_checkpoint
 from model.data.scenes import DataError
@@ -57,6 +59,29 @@ def test_a_run_ends_in_a_checkpoint_that_the_registry_loads(run: Run) -> None:
     for said in ("causal", "seed 0", command, "standard deviations times", "non-commercial", "fde_ml_6s_m"):
         assert said in card
     assert str(run.out) not in card
+
+
+@pytest.mark.parametrize("method", [Method.CAB, Method.RUBIZ])
+def test_what_was_calibrated_is_in_the_checkpoint_and_on_its_card(run: Run, method: Method) -> None:
+    folder, _ = go(replace(run, config=small_config(method, epochs=1)))
+    trained, shipped = load_file(run.out / "best.safetensors"), load_checkpoint(folder).tensors
+    changed = {name for name, tensor in trained.items() if not torch.equal(tensor, shipped[name])}
+    width, bias = "vehicle.full.decoder.log_sigma.bias", "vehicle.prior_logits.bias"
+    blind = {"vehicle.blind.decoder.log_sigma.bias"} if method is Method.RUBIZ else set()
+    assert changed == {width, bias, "vehicle.prior_logits.weight"} | blind
+    factor = (shipped[width] - trained[width]).exp()[0].item()
+    divisor = (trained[bias] / shipped[bias])[0].item()
+    card = (folder / "README.md").read_text()
+    assert f"standard deviations times {factor:.3f}" in card
+    assert f"divided by {divisor:.3f}" in card
+    assert ("of blind forecasts" in card) is bool(blind)
+
+
+def test_without_calibration_the_checkpoint_is_what_was_trained(run: Run) -> None:
+    folder, _ = go(replace(run, config=small_config(Method.CAB, epochs=1, calibrate=False)))
+    trained, shipped = load_file(run.out / "best.safetensors"), load_checkpoint(folder).tensors
+    assert all(torch.equal(tensor, shipped[name]) for name, tensor in trained.items())
+    assert "**Calibration**: none" in (folder / "README.md").read_text()
 
 
 def test_a_run_of_covernet_ends_in_a_checkpoint_with_its_cover(run: Run) -> None:
