@@ -2,11 +2,11 @@
 
 An objective that does not count its worst errors (CAB's, Reweight's and RUBiZ's clamp them), or that counts
 displacements beside the likelihood, leaves a network too sure of itself: its Gaussians are too narrow, and
-its p(z | x) puts nearly all on one mode. Two numbers, under which training positions are the likeliest, mend
-the most of that, and leave means and the order of the modes as they are: a factor on all standard deviations,
-and a temperature of the modes' logits (temperature scaling, Guo et al. 2017, section 4.2, which fits by
-likelihood, too). Wide enough for nine of ten positions to lie in the 90 % regions would take more: errors
-have longer tails than Gaussians.
+its p(z | x) puts nearly all on one mode. CoverNet's spread is that about the nearest of its trajectories, not
+about the one that it takes for the likeliest. Two numbers, under which training positions are the likeliest,
+mend the most of that, and leave means and the order of the modes as they are: a factor on all standard
+deviations, and a temperature of the modes' logits (temperature scaling, Guo et al. 2017, section 4.2, which
+fits by likelihood, too).
 """
 
 import math
@@ -21,6 +21,7 @@ from model.arrays import Floats
 from model.forecaster import Context
 from model.metrics.density import LABEL_NOISE_M, nll
 from model.mixture import TrajectoryMixture
+from model.networks.covernet import CoverNet
 from model.networks.network import AgentNetwork
 from model.training.source import BatchSource
 
@@ -41,7 +42,7 @@ class Calibration(NamedTuple):
     width: float
     """Factor on the standard deviations."""
     temperature: float
-    """Divisor of the logits of p(z | x): above 1 the modes' probabilities come nearer to each other."""
+    """Divisor of the modes' logits: above 1 their probabilities come nearer to each other."""
     blind_width: float | None = None
     """Factor on the standard deviations of blind forecasts, where the network has a branch of its own for
     them; what comes last in p(z | x) is one for both."""
@@ -57,7 +58,7 @@ class Calibration(NamedTuple):
 
 
 @torch.no_grad()
-def fit_calibration(network: AgentNetwork, pairs: BatchSource) -> Calibration:
+def fit_calibration(network: AgentNetwork | CoverNet, pairs: BatchSource) -> Calibration:
     """The one under which the pairs' positions are the likeliest, step by step.
 
     Args:
@@ -70,24 +71,28 @@ def fit_calibration(network: AgentNetwork, pairs: BatchSource) -> Calibration:
         width = _least(partial(_unlikely, judged, temperature=temperature))
         if network.config.modes > 1:
             temperature = _least(partial(_unlikely, judged, width))
-    if network.blind is None:
+    if isinstance(network, CoverNet) or network.blind is None:
         return Calibration(width, temperature)
     blind = _forecasts(network, pairs, Context.BLIND)
     return Calibration(width, temperature, _least(partial(_unlikely, blind, temperature=temperature)))
 
 
 @torch.no_grad()
-def calibrate(network: AgentNetwork, calibration: Calibration) -> None:
+def calibrate(network: AgentNetwork | CoverNet, calibration: Calibration) -> None:
     """Builds it into a network's parameters.
 
     Positions' covariances are linear in those of the controls (``model.networks.dynamics``), and only means
     are fed back in prediction: so the bias of the heads is all that changes of them.
     """
+    logits = network.logits if isinstance(network, CoverNet) else network.prior_logits
+    logits.weight.div_(calibration.temperature)
+    logits.bias.div_(calibration.temperature)
+    if isinstance(network, CoverNet):
+        network.variance.mul_(calibration.width**2)
+        return
     network.full.decoder.log_sigma.bias.add_(math.log(calibration.width))
     if network.blind is not None and calibration.blind_width is not None:
         network.blind.decoder.log_sigma.bias.add_(math.log(calibration.blind_width))
-    network.prior_logits.weight.div_(calibration.temperature)
-    network.prior_logits.bias.div_(calibration.temperature)
 
 
 _Judged = Sequence[tuple[TrajectoryMixture, Floats]]
@@ -100,7 +105,7 @@ def _unlikely(judged: _Judged, width: float, temperature: float) -> float:
     return sum(float(nll(calibration.of(mixture), truth, LABEL_NOISE_M).sum()) for mixture, truth in judged)
 
 
-def _forecasts(network: AgentNetwork, pairs: BatchSource, context: Context) -> _Judged:
+def _forecasts(network: AgentNetwork | CoverNet, pairs: BatchSource, context: Context) -> _Judged:
     chosen = torch.linspace(0, len(pairs) - 1, min(PAIRS, len(pairs))).long().unique()
     judged = []
     for indices in chosen.split(_BATCH):

@@ -42,7 +42,7 @@ class TrainingConfig(BaseModel):
     epochs: int = Field(default=40, ge=1)
     batch_size: int = Field(default=256, ge=1)
     calibrate: bool = True
-    """Whether a CVAE's widths and the temperature of its modes are fitted after training."""
+    """Whether the widths of the forecasts and the temperature of their modes are fitted after training."""
     adversarial_batch_size: int = Field(default=256, ge=1)
     """Pairs in the batches of HalentNet's adversarial parts; at most ``batch_size``."""
     kl_weight: float = Field(default=100.0, gt=0)

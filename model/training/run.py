@@ -9,7 +9,6 @@ from pathlib import Path
 import torch
 
 from model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from model.cvae import CvaeNetworks
 from model.data.batches import Batches
 from model.data.cache import Cache
 from model.data.caches import open_cache
@@ -141,7 +140,7 @@ class Run:
         trainer.networks.load_state_dict(trainer.best())
         trainer.networks.eval()
         calibration = None
-        if config.calibrate and isinstance(trainer.networks, CvaeNetworks):
+        if config.calibrate:
             vehicles = trainer.networks.of(AgentType.VEHICLE)
             calibration = fit_calibration(vehicles, train)
             calibrate(vehicles, calibration)

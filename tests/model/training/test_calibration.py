@@ -7,12 +7,16 @@ import torch
 from torch import Tensor
 
 from model.forecaster import Context, Features
+from model.metrics.density import LABEL_NOISE_M, nll
 from model.mixture import TrajectoryMixture
 from model.networks.config import BlindContext, NetworkConfig
+from model.networks.covernet import CoverNet
 from model.networks.network import AgentNetwork
 from model.scene import AgentType
 from model.training.calibration import Calibration, calibrate, fit_calibration
-from tests.model.training.fakes import MadeUpPairs
+from model.training.config import Method
+from model.training.covernet import CoverNetLearner
+from tests.model.training.fakes import MadeUpPairs, small_config
 
 
 @pytest.fixture
@@ -61,6 +65,28 @@ def test_what_the_truth_was_drawn_with_is_found(
     assert found.temperature == pytest.approx(temperature, rel=0.15)
 
 
+def test_covernet_is_calibrated_by_its_spread_and_its_logits() -> None:
+    pairs = MadeUpPairs(12)
+    torch.manual_seed(0)
+    learner = CoverNetLearner(small_config(Method.COVERNET), pairs.paths, torch.device("cpu"))
+    check_built_in(learner.network.eval(), Context.FULL)
+    found = fit_calibration(learner.network, pairs)
+    assert found.blind_width is None
+    before = validation_nll(learner.network, pairs)
+    calibrate(learner.network, found)
+    assert validation_nll(learner.network, pairs) < before
+
+
+def validation_nll(network: CoverNet, pairs: MadeUpPairs) -> float:
+    """Mean over pairs and steps, nats."""
+    features, future = pairs.batch(torch.arange(len(pairs)))
+    origin = features["origin"]
+    with torch.no_grad():
+        weights, positions = network(features, Context.FULL, 12)
+    mixture = TrajectoryMixture(weights, positions.mean, positions.covariance, origin)
+    return float(nll(mixture, (future.double() + origin[:, None]).numpy(), LABEL_NOISE_M).mean())
+
+
 def test_one_mode_has_no_temperature() -> None:
     network = AgentNetwork(NetworkConfig(modes=1), AgentType.VEHICLE).eval()
     assert fit_calibration(network, MadeUpPairs(6)).temperature == 1.0
@@ -76,7 +102,7 @@ def test_what_is_built_in_is_what_was_fitted(kind: BlindContext) -> None:
         check_built_in(copy.deepcopy(network), context)
 
 
-def check_built_in(network: AgentNetwork, context: Context) -> None:
+def check_built_in(network: AgentNetwork | CoverNet, context: Context) -> None:
     """By what a network says in a context before and after."""
     blind_width = 0.4
     calibration = Calibration(width=1.7, temperature=3.0, blind_width=blind_width)
@@ -84,7 +110,7 @@ def check_built_in(network: AgentNetwork, context: Context) -> None:
     origin = torch.zeros(6, 2, dtype=torch.float64)
     with torch.no_grad():
         weights, positions = network(features, context, 12)
-        own_branch = context is Context.BLIND and network.blind is not None
+        own_branch = context is Context.BLIND and getattr(network, "blind", None) is not None
         shown = calibration._replace(width=blind_width) if own_branch else calibration
         expected = shown.of(TrajectoryMixture(weights, positions.mean, positions.covariance, origin))
         calibrate(network, calibration)
