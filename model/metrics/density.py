@@ -64,7 +64,8 @@ def nll(mixture: TrajectoryMixture, truth: Floats, noise_m: float = 0.0) -> Floa
 
     Returns:
         [N, T], nats, of a density in 1/m²; NaN where the truth is not finite, and where a mode is singular
-        (possible without noise only): there is no density then.
+        (without noise, or where it is so wide that its covariance's rounding is more than the noise): there
+        is no density then.
     """
     wide = widened(mixture, noise_m)
     steps = -wide.log_density(torch.from_numpy(_finite(truth)))

@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Final, NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 
@@ -100,9 +101,13 @@ _Judged = Sequence[tuple[TrajectoryMixture, Floats]]
 
 
 def _unlikely(judged: _Judged, width: float, temperature: float) -> float:
-    """Negative log-likelihood of all steps, calibrated so."""
+    """Mean negative log-likelihood of a step, calibrated so.
+
+    Steps at which rounding leaves no density (a mode is kilometres wide) do not count, as in the metrics.
+    """
     calibration = Calibration(width, temperature)
-    return sum(float(nll(calibration.of(mixture), truth, LABEL_NOISE_M).sum()) for mixture, truth in judged)
+    steps = [nll(calibration.of(mixture), truth, LABEL_NOISE_M) for mixture, truth in judged]
+    return float(np.nanmean(np.concatenate(steps)))
 
 
 def _forecasts(network: AgentNetwork | CoverNet, pairs: BatchSource, context: Context) -> _Judged:

@@ -11,6 +11,7 @@ from model.metrics.density import LABEL_NOISE_M, nll
 from model.mixture import TrajectoryMixture
 from model.networks.config import BlindContext, NetworkConfig
 from model.networks.covernet import CoverNet
+from model.networks.dynamics import Positions
 from model.networks.network import AgentNetwork
 from model.scene import AgentType
 from model.training.calibration import Calibration, calibrate, fit_calibration
@@ -63,6 +64,25 @@ def test_what_the_truth_was_drawn_with_is_found(
     found = fit_calibration(network, Drawn(600, network, Calibration(width, temperature)))
     assert found.width == pytest.approx(width, rel=0.1)
     assert found.temperature == pytest.approx(temperature, rel=0.15)
+
+
+class Rounded(AgentNetwork):
+    """One of whose covariances is so large that rounding has left it without an inverse."""
+
+    def forward(self, features: Features, context: Context, steps: int) -> tuple[Tensor, Positions]:
+        log_weights, positions = super().forward(features, context, steps)
+        covariance = positions.covariance.clone()
+        covariance[0, 0, 0] = torch.tensor([[1e6, -1.001e6], [-1.001e6, 1e6]])
+        return log_weights, Positions(positions.mean, covariance)
+
+
+def test_steps_without_a_density_do_not_count(network: AgentNetwork) -> None:
+    pairs = Drawn(600, network, Calibration(2.0, 1.5))
+    rounded = Rounded(network.config, AgentType.VEHICLE).eval()
+    rounded.load_state_dict(network.state_dict())
+    found = fit_calibration(rounded, pairs)
+    assert found.width == pytest.approx(2.0, rel=0.1)
+    assert found.temperature == pytest.approx(1.5, rel=0.15)
 
 
 def test_covernet_is_calibrated_by_its_spread_and_its_logits() -> None:
