@@ -30,7 +30,8 @@ class CoverNet(nn.Module):
     trained on data without pedestrians takes one for something small, not for nothing or anything.
 
     Its logits are over all M members of the set; a forecast is the likeliest K of them, laid where the agent
-    is, with the spread that the training trajectories have about their nearest members.
+    is, with the spread that the training trajectories have about their nearest members, calibrated after
+    training.
 
     Args:
         config: its shape, ``members`` known.
@@ -42,7 +43,7 @@ class CoverNet(nn.Module):
     cover: Tensor
     """[M, T, 2], m, x ahead and y to the left of the agent now."""
     variance: Tensor
-    """[T, 2], m², of the truth about its member, ahead and to the left."""
+    """[T, 2], m², of the truth about its member, ahead and to the left; after calibration, of a forecast."""
 
     def __init__(self, config: CoverNetConfig) -> None:
         super().__init__()

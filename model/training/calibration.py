@@ -111,6 +111,7 @@ def _unlikely(judged: _Judged, width: float, temperature: float) -> float:
 
 
 def _forecasts(network: AgentNetwork | CoverNet, pairs: BatchSource, context: Context) -> _Judged:
+    """Of some of the pairs, in one context."""
     chosen = torch.linspace(0, len(pairs) - 1, min(PAIRS, len(pairs))).long().unique()
     judged = []
     for indices in chosen.split(_BATCH):

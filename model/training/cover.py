@@ -28,7 +28,7 @@ class Cover(NamedTuple):
     Those that cover most come first."""
     variance: Tensor
     """[T, 2] float32, m²: mean square of what the trajectories differ by, ahead and to the left, from their
-    nearest members (``nearest_member``)."""
+    nearest members (by ``summed_distances``)."""
 
 
 def make_cover(paths: Tensor, epsilon: float) -> Cover:
@@ -125,16 +125,6 @@ def _within(ones: Float32s, others: Float32s, reach: float) -> Bools:
         y = ones[:, step, 1, None] - others[None, :, step, 1]
         inside &= x * x + y * y <= reach * reach
     return inside
-
-
-def nearest_member(paths: Tensor, members: Tensor) -> Tensor:
-    """The member with the least mean distance over the steps from each path: [N] int64.
-
-    Args:
-        paths: [N, T, 2], m, in the agents' own frames.
-        members: [M, T, 2], on the same device.
-    """
-    return summed_distances(paths, members).argmin(dim=1)
 
 
 def summed_distances(paths: Tensor, members: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as arrays
 
 from model.arrays import Float32s
 from model.training import cover
-from model.training.cover import cover_indices, make_cover, nearest_member
+from model.training.cover import cover_indices, make_cover, summed_distances
 
 EPSILON = 2.0
 PATHS = arrays.arrays(
@@ -60,7 +60,7 @@ def test_each_member_covers_as_much_as_any_path_could_then(paths: Float32s) -> N
 def test_members_are_paths_and_the_variance_is_about_the_nearest(paths: Float32s) -> None:
     members, variance = make_cover(torch.from_numpy(paths), EPSILON)
     assert (members[:, None] == torch.from_numpy(paths)).all(dim=(2, 3)).any(dim=1).all()
-    rest = torch.from_numpy(paths) - members[nearest_member(torch.from_numpy(paths), members)]
+    rest = torch.from_numpy(paths) - members[summed_distances(torch.from_numpy(paths), members).argmin(dim=1)]
     torch.testing.assert_close(variance, rest.square().mean(dim=0), rtol=1e-4, atol=1e-6)
 
 
@@ -77,7 +77,7 @@ def test_little_memory_gives_the_same_cover(monkeypatch: pytest.MonkeyPatch) -> 
 def test_the_nearest_member_is_so_on_the_mean() -> None:
     members = torch.tensor([[[0.0, 0.0], [0.0, 0.0]], [[1.0, 0.0], [5.0, 0.0]]])
     paths = torch.tensor([[[1.0, 0.0], [2.0, 0.0]], [[1.0, 0.0], [3.5, 0.0]]])
-    assert nearest_member(paths, members).tolist() == [0, 1]
+    assert summed_distances(paths, members).argmin(dim=1).tolist() == [0, 1]
 
 
 @pytest.mark.parametrize("paths", [np.zeros((0, 12, 2)), np.full((3, 12, 2), np.nan)])
