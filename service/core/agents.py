@@ -235,7 +235,7 @@ class _StateTable:
 
     def _first_of_each(self, rows: Ints) -> list[int]:
         """The first of these rows of each agent that has no fault yet: only one an agent is told, and to
-        put a million into words takes seconds.
+        put a hundred thousand into words takes a quarter of a second.
 
         Args:
             rows: [R], ascending.
