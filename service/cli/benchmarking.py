@@ -28,12 +28,14 @@ from benchmark.files import replacing
 from benchmark.models import choose, key, unfit
 from benchmark.replay import RETRIES
 from benchmark.results import Results, write_instances
+from benchmark.rules import RULES_FILE, rules
 from benchmark.run import Benchmark, listed_models
 from benchmark.submission import submission_entries, write_submission
 from benchmark.tables import left_out, markdown, tables
 from cab.forecast.v1.model_service_pb2 import Model
 from cab_forecast import AsyncClient
 from model.arrays import Floats
+from model.forecaster import Protocol
 from service.cli.tables import show_tables
 
 TABLES_FILE = "tables.md"
@@ -85,6 +87,9 @@ def show_benchmark(
     write_instances(out, judged.each)
     with replacing(out / TABLES_FILE) as temporary:
         temporary.write_text(markdown(results), encoding="utf-8")
+    if whole.protocol is Protocol.CAUSAL and whole.judging.consistency:
+        with replacing(out / RULES_FILE) as temporary:
+            temporary.write_text(rules(results), encoding="utf-8")
     page = _page(whole, results, judged.mismatch_m, out, console)
     written = [*([] if page is None else [page]), *_submissions(whole, models, out, console)]
     show_tables(tables(results), out)

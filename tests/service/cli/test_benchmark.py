@@ -15,6 +15,7 @@ import pytest
 from typer.testing import CliRunner
 
 from benchmark.archive import FILE
+from benchmark.rules import RULES_FILE
 from model.data.sources import READERS, parse_data
 from service.cli.main import app
 from service.server import Server
@@ -59,7 +60,7 @@ def test_the_tables_of_a_run_and_of_its_saved_answers(tmp_path: Path, data: str,
     asked = ("--endpoint", f"grpc://{server.grpc_address}", "--samples", "5", "--processes", "1")
     code, shown, said = run("--data", data, "--out", str(out), *asked)
     assert code == 0, said
-    for file in ("results.json", "tables.md", "report.html", "instances.npz", FILE):
+    for file in ("results.json", "tables.md", "report.html", "instances.npz", RULES_FILE, FILE):
         assert (out / file).stat().st_size > 0, file
     assert not list(out.glob("submission-*"))  # this data has no tokens
     for text in ("physics-oracle", "kalman", "causal protocol, nuscenes_pred split train_val"):
