@@ -1,10 +1,16 @@
-"""How a method is trained: one TOML file each in ``methods/``."""
+"""How a method is trained: one TOML file each in ``methods/``.
+
+Where it says nothing, a method is trained as by the authors' released code: those are the defaults here,
+but for ``calibrate`` and ``precision``. Its table ``published`` says what that code has in place of the
+file's own settings.
+"""
 
 import json
 import tomllib
 from enum import StrEnum
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -108,6 +114,9 @@ class TrainingConfig(BaseModel):
         return "\n".join([*lines, "", "[network]", *(f"{n} = {json.dumps(v)}" for n, v in network.items())])
 
 
+_WHAT_IT_IS = {"description", "network"}
+
+
 def parse_method(name: str) -> Method:
     """A method by its name.
 
@@ -120,24 +129,34 @@ def parse_method(name: str) -> Method:
         raise TrainingError(f"there is no method {name!r}; there are {', '.join(Method)}") from None
 
 
-def load_config(method: Method, file: Path | None = None, **changes: object) -> TrainingConfig:
+def load_config(
+    method: Method, file: Path | None = None, published: bool = False, **changes: object
+) -> TrainingConfig:
     """A method's settings.
 
     Args:
         method: whose.
         file: TOML to take them from instead of the one that comes with the package.
-        changes: single settings that go before the file's; None counts as not given.
+        published: train as the released code does; of the file, its table ``published``, description and
+            network count.
+        changes: single settings that go before the file's; None counts as not given. Fewer epochs than are
+            to cool down all cool down.
 
     Raises:
         TrainingError: the file is missing or wrong, naming it and the setting.
     """
     source = resources.files("model.training") / "methods" / f"{method.value}.toml" if file is None else file
     try:
-        values = tomllib.loads(source.read_text(encoding="utf-8"))
+        values: dict[str, Any] = tomllib.loads(source.read_text(encoding="utf-8"))
         if "start" in values:
             raise TrainingError(f"{source}: start is a checkpoint's folder, to be given to train itself")
-        given = {name: value for name, value in changes.items() if value is not None}
-        config = TrainingConfig.model_validate({"method": method, **values, **given})
+        released = values.pop("published", None)
+        if published:
+            if not isinstance(released, dict):
+                raise TrainingError(f"{source}: has no table [published]")
+            values = {**released, **{name: values[name] for name in _WHAT_IT_IS & values.keys()}}
+        given: dict[str, Any] = {name: value for name, value in changes.items() if value is not None}
+        config = TrainingConfig.model_validate({"method": method, **values, **_cooled(values, given)})
     except OSError as error:
         raise TrainingError(f"{source}: cannot be read: {error.strerror}") from error
     except ValidationError as error:
@@ -148,3 +167,11 @@ def load_config(method: Method, file: Path | None = None, **changes: object) -> 
     if config.method is not method:
         raise TrainingError(f"{source}: is of method {config.method.value}, not {method.value}")
     return config
+
+
+def _cooled(values: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
+    """What is given; where it makes fewer epochs than the file cools down, they all do."""
+    cooling, epochs = values.get("cooldown_epochs"), given.get("epochs")
+    if "cooldown_epochs" in given or not isinstance(cooling, int) or not isinstance(epochs, int):
+        return given
+    return {**given, "cooldown_epochs": min(cooling, epochs)}

@@ -248,6 +248,31 @@ def test_every_method_has_its_settings(method: Method) -> None:
 
 
 @pytest.mark.parametrize("method", list(Method))
+def test_every_method_is_trained_as_published_on_request(method: Method) -> None:
+    ours, published = load_config(method), load_config(method, published=True)
+    assert published.network == ours.network
+    assert (published.kl_weight, published.apart_weight, published.epochs) == (100, 5, 40)
+    assert published.displacement_weight == 0 < ours.displacement_weight
+    assert published.rotate is ours.rotate
+    assert load_config(method, published=True, epochs=3).epochs == 3
+    changes = {"displacement_weight", "epochs", "cooldown_epochs", "averaging"}
+    assert {name for name, value in published if value != getattr(ours, name)} >= changes
+
+
+def test_of_few_epochs_all_cool_down() -> None:
+    assert load_config(Method.CAB).cooldown_epochs > 3
+    assert load_config(Method.CAB, epochs=3).cooldown_epochs == 3
+    assert load_config(Method.CAB, epochs=3, cooldown_epochs=1).cooldown_epochs == 1
+    with pytest.raises(TrainingError, match="cooldown_epochs 4 is more than epochs 3"):
+        load_config(Method.CAB, epochs=3, cooldown_epochs=4)
+
+
+def test_the_released_learning_rates() -> None:
+    assert load_config(Method.CAB, published=True).learning_rate == 0.003
+    assert load_config(Method.TRAJECTRON, published=True).learning_rate == 0.002
+
+
+@pytest.mark.parametrize("method", list(Method))
 def test_the_settings_on_a_card_are_a_settings_file(tmp_path: Path, method: Method) -> None:
     config = load_config(method, epochs=7, kl_weight=2.5)
     file = tmp_path / "settings.toml"
@@ -262,6 +287,9 @@ def test_wrong_settings_are_named(tmp_path: Path) -> None:
         load_config(Method.CAB, file)
     with pytest.raises(TrainingError, match="cannot be read"):
         load_config(Method.CAB, tmp_path / "nowhere.toml")
+    file.write_text(load_config(Method.CAB).toml())
+    with pytest.raises(TrainingError, match=r"has no table \[published\]"):
+        load_config(Method.CAB, file, published=True)
     file.write_text('description = ""\nlearning_rate = 1\n[network]\nkind = "covernet"\n')
     with pytest.raises(TrainingError, match="of kind covernet does not learn by cab"):
         load_config(Method.CAB, file)
