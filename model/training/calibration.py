@@ -30,6 +30,8 @@ PAIRS: Final = 2048
 """That the numbers are fitted to, spread over the split."""
 LEAST, MOST = 0.1, 100.0
 """Bounds of the numbers."""
+_NEAR: Final = 1.02
+"""A factor; within it of a bound is at the bound."""
 _BATCH: Final = 256
 _TURNS: Final = 3
 """How often each number is fitted with the other one held."""
@@ -47,6 +49,12 @@ class Calibration(NamedTuple):
     blind_width: float | None = None
     """Factor on the standard deviations of blind forecasts, where the network has a branch of its own for
     them; what comes last in p(z | x) is one for both."""
+
+    @property
+    def ran_away(self) -> bool:
+        """Whether a number came to a bound: no factor, or no temperature, suits what the network says."""
+        numbers = (self.width, self.temperature, self.blind_width or 1.0)
+        return any(not LEAST * _NEAR < number < MOST / _NEAR for number in numbers)
 
     def of(self, mixture: TrajectoryMixture) -> TrajectoryMixture:
         """Forecasts of full context with it."""

@@ -104,7 +104,7 @@ class Run:
             data = f"{self.source.kind}, split {self.source.train_split}: {len(train)} pairs"
             split = f"{self.source.kind}, split {self.source.validation_split} ({len(judged)} pairs)"
             origin = Origin(data, self.source.protocol, split, self._command(), _machine())
-            self._write_checkpoint(trainer, batches, validation, origin)
+            self._write_checkpoint(trainer, batches, validation, origin, said)
         return self.out / "checkpoint"
 
     def _command(self) -> str:
@@ -133,7 +133,12 @@ class Run:
         )
 
     def _write_checkpoint(
-        self, trainer: Trainer, train: Batches, validation: Validation, origin: Origin
+        self,
+        trainer: Trainer,
+        train: Batches,
+        validation: Validation,
+        origin: Origin,
+        said: Callable[[str], None],
     ) -> None:
         # The networks' own: what is made when training begins is known there only
         config, network = self.config, trainer.networks.config
@@ -144,6 +149,8 @@ class Run:
             vehicles = trainer.networks.of(AgentType.VEHICLE)
             calibration = fit_calibration(vehicles, train)
             calibrate(vehicles, calibration)
+            if calibration.ran_away:
+                said(f"the calibration ran to a bound, look at the figures: {calibration}")
         figures = validation.judge(trainer.networks, samples=SAMPLES, draws=DRAWS)
         begun = "" if config.start is None else f"; begun with {config.start}"
         info = ModelInfo(

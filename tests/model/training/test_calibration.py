@@ -1,6 +1,7 @@
 """How sure forecasts are of themselves, fitted after training."""
 
 import copy
+import math
 
 import pytest
 import torch
@@ -14,7 +15,7 @@ from model.networks.covernet import CoverNet
 from model.networks.dynamics import Positions
 from model.networks.network import AgentNetwork
 from model.scene import AgentType
-from model.training.calibration import Calibration, calibrate, fit_calibration
+from model.training.calibration import LEAST, MOST, Calibration, _least, calibrate, fit_calibration
 from model.training.config import Method
 from model.training.covernet import CoverNetLearner
 from tests.model.training.fakes import MadeUpPairs, small_config
@@ -140,3 +141,13 @@ def check_built_in(network: AgentNetwork | CoverNet, context: Context) -> None:
     assert not torch.allclose(weights, weights_after)
     torch.testing.assert_close(weights_after, expected.log_weights)
     torch.testing.assert_close(after.covariance, expected.covariances, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("number", [LEAST, MOST])
+def test_a_number_at_a_bound_is_known(number: float) -> None:
+    found = _least(lambda value: abs(math.log(value / number)))
+    assert Calibration(found, 1.0).ran_away
+    assert Calibration(1.0, found).ran_away
+    assert Calibration(1.0, 1.0, found).ran_away
+    assert not Calibration(0.2, 50.0, 2.0).ran_away
+    assert not Calibration(0.2, 50.0).ran_away

@@ -15,6 +15,7 @@ from model.forecaster import Protocol
 from model.networks.config import CoverNetConfig
 from model.registry import Registry
 from model.scene import AgentType
+from model.training.calibration import MOST, Calibration
 from model.training.config import Method
 from model.training.logs import RunLog
 from model.training.run import Run, Source
@@ -75,6 +76,14 @@ def test_what_was_calibrated_is_in_the_checkpoint_and_on_its_card(run: Run, meth
     assert f"standard deviations times {factor:.3f}" in card
     assert f"divided by {divisor:.3f}" in card
     assert ("of blind forecasts" in card) is bool(blind)
+
+
+def test_a_calibration_that_ran_away_is_said(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    once = replace(run, config=small_config(Method.CAB, epochs=1))
+    monkeypatch.setattr("model.training.run.fit_calibration", lambda *_: Calibration(1.0, MOST))
+    once.train(lambda *_: None, lambda *_: None, said.append)
+    assert any("ran to a bound" in line and "temperature=100.0" in line for line in said)
 
 
 def test_without_calibration_the_checkpoint_is_what_was_trained(run: Run) -> None:
