@@ -40,6 +40,10 @@ class NetworkConfig(BaseModel):
     modes: int = Field(default=25, ge=1, le=255)
     """K, categories of the latent variable."""
     blind: BlindContext = BlindContext.NONE
+    max_control_sigma: float | None = Field(default=None, gt=0)
+    """Bound of the controls' standard deviations in training, m/s² and rad/s (pedestrians: m/s); calibration
+    scales it with them. None: there is none, as published; a mode may then become kilometres wide, and stand
+    for whatever the others do not explain."""
 
     @model_validator(mode="after")
     def _types_have_states(self) -> "NetworkConfig":

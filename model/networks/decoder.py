@@ -1,5 +1,6 @@
 """The decoder: one mode a latent category, a control Gaussian a step."""
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -17,7 +18,12 @@ class ModeDecoder(nn.Module):
     Its input is [z, x, a]: the one-hot category, the encoding, and the control of the step before.
     """
 
-    def __init__(self, modes: int, encoding_size: int, state_size: int) -> None:
+    log_sigma_bound: Tensor | None
+    """[], of the logarithms of the controls' standard deviations; None: there is none."""
+
+    def __init__(
+        self, modes: int, encoding_size: int, state_size: int, max_sigma: float | None = None
+    ) -> None:
         super().__init__()
         self.modes = modes
         self.initial_h = nn.Linear(modes + encoding_size, DECODER_HIDDEN)
@@ -26,6 +32,8 @@ class ModeDecoder(nn.Module):
         self.mean = nn.Linear(DECODER_HIDDEN, 2)
         self.log_sigma = nn.Linear(DECODER_HIDDEN, 2)
         self.correlation = nn.Linear(DECODER_HIDDEN, 1)
+        bound = None if max_sigma is None else torch.tensor(math.log(max_sigma))
+        self.register_buffer("log_sigma_bound", bound)
         self.training_dtype = torch.float32
         """Of the unrolled cell in training; the heads, and all that follows them, are in float32."""
 
@@ -99,6 +107,9 @@ class ModeDecoder(nn.Module):
         w_gates, w_new = w_a[:split].T.to(dtype), w_a[split:].T.to(dtype)
         weight = torch.cat([self.mean.weight, self.log_sigma.weight, self.correlation.weight])
         head_bias = torch.cat([self.mean.bias, self.log_sigma.bias, self.correlation.bias])
+        most = head_bias.new_full(head_bias.shape, math.inf)
+        if self.log_sigma_bound is not None:
+            most[2:4] = self.log_sigma_bound
         hidden = hidden.to(dtype)
         outputs: list[Tensor] = []
         actions: list[Tensor] = []
@@ -109,7 +120,8 @@ class ModeDecoder(nn.Module):
                 constant = given
             fed = action.to(dtype)
             hidden = self.cell(torch.addmm(gates, fed, w_gates), torch.addmm(new, fed, w_new), hidden)
-            outputs.append(F.linear(hidden.to(weight.dtype), weight, head_bias))
+            heads = F.linear(hidden.to(weight.dtype), weight, head_bias)
+            outputs.append(heads if self.log_sigma_bound is None else heads.minimum(most))
             action = _sample(outputs[-1]) if sample_controls else outputs[-1][:, :2]
             actions.append(action)
         return outputs, actions

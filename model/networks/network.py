@@ -18,12 +18,15 @@ PRIOR_DROPOUT = 0.1
 class Branch(nn.Module):
     """What follows an encoding: prior, posterior, decoder and, for a vehicle, the heading's correction."""
 
-    def __init__(self, modes: int, encoding_size: int, state_size: int, corrects_heading: bool) -> None:
+    def __init__(
+        self, config: NetworkConfig, encoding_size: int, state_size: int, corrects_heading: bool
+    ) -> None:
         super().__init__()
+        modes = config.modes
         self.prior_hidden = nn.Linear(encoding_size, HIDDEN)
         self.prior_dropout = nn.Dropout(PRIOR_DROPOUT)
         self.posterior_logits = nn.Linear(encoding_size + 4 * HIDDEN, modes)
-        self.decoder = ModeDecoder(modes, encoding_size, state_size)
+        self.decoder = ModeDecoder(modes, encoding_size, state_size, config.max_control_sigma)
         self.heading_correction = nn.Linear(encoding_size + 1, 1) if corrects_heading else None
 
 
@@ -49,10 +52,9 @@ class AgentNetwork(nn.Module):
         self.map_encoder = MapEncoder() if config.looks_at_map(agent_type) else None
         self.future_encoder = FutureEncoder(state_size)
         self.prior_logits = nn.Linear(HIDDEN, config.modes)  # of both branches, as released
-        self.full = Branch(config.modes, config.encoding_size(agent_type), state_size, vehicle)
-        self.blind = (
-            Branch(config.modes, HIDDEN, state_size, vehicle) if config.blind is BlindContext.OWN else None
-        )
+        self.full = Branch(config, config.encoding_size(agent_type), state_size, vehicle)
+        own = config.blind is BlindContext.OWN
+        self.blind = Branch(config, HIDDEN, state_size, vehicle) if own else None
 
     def branch(self, context: Context) -> Branch:
         """The branch that forecasts in that context.

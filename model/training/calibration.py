@@ -23,6 +23,7 @@ from model.forecaster import Context
 from model.metrics.density import LABEL_NOISE_M, nll
 from model.mixture import TrajectoryMixture
 from model.networks.covernet import CoverNet
+from model.networks.decoder import ModeDecoder
 from model.networks.network import AgentNetwork
 from model.training.source import BatchSource
 
@@ -91,7 +92,7 @@ def calibrate(network: AgentNetwork | CoverNet, calibration: Calibration) -> Non
     """Builds it into a network's parameters.
 
     Positions' covariances are linear in those of the controls (``model.networks.dynamics``), and only means
-    are fed back in prediction: so the bias of the heads is all that changes of them.
+    are fed back in prediction: so their heads' bias, and their bound, is all that changes.
     """
     logits = network.logits if isinstance(network, CoverNet) else network.prior_logits
     logits.weight.div_(calibration.temperature)
@@ -99,9 +100,15 @@ def calibrate(network: AgentNetwork | CoverNet, calibration: Calibration) -> Non
     if isinstance(network, CoverNet):
         network.variance.mul_(calibration.width**2)
         return
-    network.full.decoder.log_sigma.bias.add_(math.log(calibration.width))
+    _widen(network.full.decoder, calibration.width)
     if network.blind is not None and calibration.blind_width is not None:
-        network.blind.decoder.log_sigma.bias.add_(math.log(calibration.blind_width))
+        _widen(network.blind.decoder, calibration.blind_width)
+
+
+def _widen(decoder: ModeDecoder, factor: float) -> None:
+    decoder.log_sigma.bias.add_(math.log(factor))
+    if decoder.log_sigma_bound is not None:
+        decoder.log_sigma_bound.add_(math.log(factor))
 
 
 _Judged = Sequence[tuple[TrajectoryMixture, Floats]]

@@ -154,6 +154,9 @@ def load_config(
         if published:
             if not isinstance(released, dict):
                 raise TrainingError(f"{source}: has no table [published]")
+            network = values.get("network")
+            if isinstance(network, dict):
+                network.pop("max_control_sigma", None)
             values = {**released, **{name: values[name] for name in _WHAT_IT_IS & values.keys()}}
         given: dict[str, Any] = {name: value for name, value in changes.items() if value is not None}
         config = TrainingConfig.model_validate({"method": method, **values, **_cooled(values, given)})

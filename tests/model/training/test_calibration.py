@@ -113,11 +113,13 @@ def test_one_mode_has_no_temperature() -> None:
     assert fit_calibration(network, MadeUpPairs(6)).temperature == 1.0
 
 
+@pytest.mark.parametrize("bound", [None, 0.8])
 @pytest.mark.parametrize("kind", BlindContext)
-def test_what_is_built_in_is_what_was_fitted(kind: BlindContext) -> None:
+def test_what_is_built_in_is_what_was_fitted(kind: BlindContext, bound: float | None) -> None:
     """Covariances and probabilities change as the calibration says; means, and the modes' order, do not."""
     torch.manual_seed(0)
-    network = AgentNetwork(NetworkConfig(modes=5, blind=kind), AgentType.VEHICLE).eval()
+    config = NetworkConfig(modes=5, blind=kind, max_control_sigma=bound)
+    network = AgentNetwork(config, AgentType.VEHICLE).eval()
     contexts = (Context.FULL,) if kind is BlindContext.NONE else tuple(Context)
     for context in contexts:
         check_built_in(copy.deepcopy(network), context)
