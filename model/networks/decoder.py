@@ -19,7 +19,7 @@ class ModeDecoder(nn.Module):
     """
 
     log_sigma_bound: Tensor | None
-    """[], of the logarithms of the controls' standard deviations; None: there is none."""
+    """[], of the logarithms of the controls' standard deviations in prediction; None: there is none."""
 
     def __init__(
         self, modes: int, encoding_size: int, state_size: int, max_sigma: float | None = None
@@ -107,8 +107,9 @@ class ModeDecoder(nn.Module):
         w_gates, w_new = w_a[:split].T.to(dtype), w_a[split:].T.to(dtype)
         weight = torch.cat([self.mean.weight, self.log_sigma.weight, self.correlation.weight])
         head_bias = torch.cat([self.mean.bias, self.log_sigma.bias, self.correlation.bias])
-        most = head_bias.new_full(head_bias.shape, math.inf)
-        if self.log_sigma_bound is not None:
+        most: Tensor | None = None
+        if self.log_sigma_bound is not None and not self.training:
+            most = head_bias.new_full(head_bias.shape, math.inf)
             most[2:4] = self.log_sigma_bound
         hidden = hidden.to(dtype)
         outputs: list[Tensor] = []
@@ -121,7 +122,7 @@ class ModeDecoder(nn.Module):
             fed = action.to(dtype)
             hidden = self.cell(torch.addmm(gates, fed, w_gates), torch.addmm(new, fed, w_new), hidden)
             heads = F.linear(hidden.to(weight.dtype), weight, head_bias)
-            outputs.append(heads if self.log_sigma_bound is None else heads.minimum(most))
+            outputs.append(heads if most is None else heads.minimum(most))
             action = _sample(outputs[-1]) if sample_controls else outputs[-1][:, :2]
             actions.append(action)
         return outputs, actions
