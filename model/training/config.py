@@ -7,6 +7,7 @@ file's own settings.
 
 import json
 import tomllib
+from collections.abc import Mapping
 from enum import StrEnum
 from importlib import resources
 from pathlib import Path
@@ -114,9 +115,6 @@ class TrainingConfig(BaseModel):
         return "\n".join([*lines, "", "[network]", *(f"{n} = {json.dumps(v)}" for n, v in network.items())])
 
 
-_WHAT_IT_IS = {"description", "network"}
-
-
 def parse_method(name: str) -> Method:
     """A method by its name.
 
@@ -152,12 +150,7 @@ def load_config(
             raise TrainingError(f"{source}: start is a checkpoint's folder, to be given to train itself")
         released = values.pop("published", None)
         if published:
-            if not isinstance(released, dict):
-                raise TrainingError(f"{source}: has no table [published]")
-            network = values.get("network")
-            if isinstance(network, dict):
-                network.pop("max_control_sigma", None)
-            values = {**released, **{name: values[name] for name in _WHAT_IT_IS & values.keys()}}
+            values = _as_published(values, released, str(source))
         given: dict[str, Any] = {name: value for name, value in changes.items() if value is not None}
         config = TrainingConfig.model_validate({"method": method, **values, **_cooled(values, given)})
     except OSError as error:
@@ -172,7 +165,17 @@ def load_config(
     return config
 
 
-def _cooled(values: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
+def _as_published(values: Mapping[str, Any], released: object, source: str) -> dict[str, Any]:
+    """Of a file's values what the method is, with the file's table of what the released code has."""
+    if not isinstance(released, dict):
+        raise TrainingError(f"{source}: has no table [published]")
+    kept = {name: values[name] for name in ("description", "network") if name in values}
+    if isinstance(network := kept.get("network"), dict):
+        kept["network"] = {name: value for name, value in network.items() if name != "max_control_sigma"}
+    return {**released, **kept}
+
+
+def _cooled(values: Mapping[str, Any], given: dict[str, Any]) -> dict[str, Any]:
     """What is given; where it makes fewer epochs than the file cools down, they all do."""
     cooling, epochs = values.get("cooldown_epochs"), given.get("epochs")
     if "cooldown_epochs" in given or not isinstance(cooling, int) or not isinstance(epochs, int):
