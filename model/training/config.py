@@ -63,6 +63,9 @@ class TrainingConfig(BaseModel):
     """1/m, of the distance of the modes (of CoverNet, the members) from the truth, summed over the steps and
     expected under their probabilities; as released, 0. The likelihood alone leaves it open which mode is the
     likeliest: this asks that it be a near one."""
+    displacement_after: int = Field(default=0, ge=0)
+    """Epochs without it: with it from the start, modes come to lie on each other before they have learned to
+    differ."""
     learning_rate: float = Field(gt=0)
     """At the first step; decays by ``learning_rate_decay`` a step, not below ``least_learning_rate``."""
     learning_rate_decay: float = Field(default=0.9999, gt=0, le=1)
@@ -137,8 +140,8 @@ def load_config(
         file: TOML to take them from instead of the one that comes with the package.
         published: train as the released code does; of the file, its table ``published``, description and
             network count.
-        changes: single settings that go before the file's; None counts as not given. Fewer epochs than are
-            to cool down all cool down.
+        changes: single settings that go before the file's; None counts as not given. Of fewer epochs than are
+            to cool down all cool down, and half have the displacement.
 
     Raises:
         TrainingError: the file is missing or wrong, naming it and the setting.
@@ -152,7 +155,7 @@ def load_config(
         if published:
             values = _as_published(values, released, str(source))
         given: dict[str, Any] = {name: value for name, value in changes.items() if value is not None}
-        config = TrainingConfig.model_validate({"method": method, **values, **_cooled(values, given)})
+        config = TrainingConfig.model_validate({"method": method, **values, **_shortened(values, given)})
     except OSError as error:
         raise TrainingError(f"{source}: cannot be read: {error.strerror}") from error
     except ValidationError as error:
@@ -175,9 +178,15 @@ def _as_published(values: Mapping[str, Any], released: object, source: str) -> d
     return {**released, **kept}
 
 
-def _cooled(values: Mapping[str, Any], given: dict[str, Any]) -> dict[str, Any]:
-    """What is given; where it makes fewer epochs than the file cools down, they all do."""
-    cooling, epochs = values.get("cooldown_epochs"), given.get("epochs")
-    if "cooldown_epochs" in given or not isinstance(cooling, int) or not isinstance(epochs, int):
+def _shortened(values: Mapping[str, Any], given: dict[str, Any]) -> dict[str, Any]:
+    """What is given; where it makes fewer epochs than a file's phases take, these are shortened."""
+    epochs = given.get("epochs")
+    if not isinstance(epochs, int):
         return given
-    return {**given, "cooldown_epochs": min(cooling, epochs)}
+    most = {"cooldown_epochs": epochs, "displacement_after": epochs // 2}
+    phases = {
+        name: min(length, most[name])
+        for name, length in values.items()
+        if name in most and isinstance(length, int)
+    }
+    return {**phases, **given}

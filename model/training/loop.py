@@ -160,11 +160,13 @@ class Trainer:
     def _step(self, batches: Sequence[Batch]) -> dict[str, Tensor]:
         step = self.progress.step
         annealed = step if self.config.start is None else step + ANNEALED
+        asked = self.progress.epoch >= self.config.displacement_after
+        displacement = self.config.displacement_weight if asked else 0.0
         weights = Weights(
             self.config.kl_weight * KL_SHARE(annealed),
             Z_LOGIT_CLIP(annealed),
             least_step_likelihood=self.config.least_step_likelihood,
-            displacement=self.config.displacement_weight,
+            displacement=displacement,
             apart=self.config.apart_weight,
         )
         terms = self.learner.step(batches, weights, self._rate())

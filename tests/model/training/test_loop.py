@@ -127,6 +127,17 @@ def test_dropout_is_scaled_in_every_method(tmp_path: Path, method: Method, facto
     assert scaled == [rate * factor for rate in released]
 
 
+@pytest.mark.parametrize("method", [Method.CAB, Method.COVERNET])
+def test_the_displacement_may_come_later(tmp_path: Path, method: Method) -> None:
+    _, reports = train(
+        small_config(method, epochs=2, displacement_weight=1.0, displacement_after=1), tmp_path
+    )
+    without, with_it = ({name for name in each if name.startswith("displacement")} for each in reports)
+    assert not without
+    assert with_it
+    assert reports[1]["loss"] > reports[0]["loss"]  # of some metres a step more
+
+
 def test_covernet_is_not_mirrored() -> None:
     with pytest.raises(ValidationError, match="does not cover mirrored ones"):
         small_config(Method.COVERNET, mirror=True)
@@ -261,9 +272,13 @@ def test_every_method_is_trained_as_published_on_request(method: Method) -> None
     assert {name for name, value in published if value != getattr(ours, name)} >= changes
 
 
-def test_of_few_epochs_all_cool_down() -> None:
-    assert load_config(Method.CAB).cooldown_epochs > 3
-    assert load_config(Method.CAB, epochs=3).cooldown_epochs == 3
+def test_a_short_run_has_short_phases() -> None:
+    whole, short = load_config(Method.CAB), load_config(Method.CAB, epochs=3)
+    assert whole.cooldown_epochs > 3
+    assert whole.displacement_after > 1
+    assert (short.cooldown_epochs, short.displacement_after) == (3, 1)
+    more = load_config(Method.CAB, epochs=whole.epochs + 1)
+    assert more == whole.model_copy(update={"epochs": whole.epochs + 1})
     assert load_config(Method.CAB, epochs=3, cooldown_epochs=1).cooldown_epochs == 1
     with pytest.raises(TrainingError, match="cooldown_epochs 4 is more than epochs 3"):
         load_config(Method.CAB, epochs=3, cooldown_epochs=4)
