@@ -8,7 +8,9 @@ import math
 from collections.abc import Mapping
 from typing import Final
 
+from benchmark.models import oldest_first
 from benchmark.results import ModelResult, Results
+from model.forecaster import Protocol
 
 RULES_FILE: Final = "benchmark.yml"
 """Of the same name as the file in ``deploy/prometheus/`` that it may take the place of."""
@@ -34,18 +36,23 @@ _RULE: Final = """\
 
 
 def rules(results: Results) -> str:
-    """The file; of two versions of a model, which live figures do not tell apart, the later one counts.
+    """The file; empty where there is nothing to compare with.
+
+    Live figures do not tell versions of a model apart: the newest counts, which calls get that name none.
 
     Args:
         results: by the causal protocol, as live inputs are.
     """
-    models = {model.name: model for model in results.models if model.version}
+    asked = {one.key: one for one in results.models if one.version and one.protocol != Protocol.PAPER.value}
+    models = {asked[key].name: asked[key] for key in oldest_first(asked)}
+    dispersion = _rules(models, "forecast:benchmark_dispersion_meters", "dispersion_std_m")
+    convergence = _rules(models, "forecast:benchmark_convergence_seconds", "convergence_1m_s", ', tau: "1"')
+    if not dispersion + convergence:
+        return ""
     return _FILE.format(
         statement=results.statement(),
-        dispersion=_rules(models, "forecast:benchmark_dispersion_meters", "dispersion_std_m"),
-        convergence=_rules(
-            models, "forecast:benchmark_convergence_seconds", "convergence_1m_s", ', tau: "1"'
-        ),
+        dispersion=dispersion,
+        convergence=convergence,
     )
 
 

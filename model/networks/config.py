@@ -41,7 +41,7 @@ class NetworkConfig(BaseModel):
     """K, categories of the latent variable."""
     blind: BlindContext = BlindContext.NONE
     max_control_sigma: float | None = Field(default=None, gt=0)
-    """Bound of the controls' standard deviations in prediction, m/s² and rad/s (pedestrians: m/s), before
+    """Bound of the controls' standard deviations in prediction, rad/s and m/s² (pedestrians: m/s), before
     calibration, which scales it with them. Training has none: there a mode may become kilometres wide and
     stand for whatever the others do not explain, so that these need not. None: no bound, as published."""
 

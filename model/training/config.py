@@ -36,6 +36,10 @@ class Method(StrEnum):
     COVERNET = "covernet"
 
 
+BLIND = frozenset({Method.CAB, Method.REWEIGHT, Method.RUBIZ})
+"""Methods whose objectives compare with a blind forecast."""
+
+
 class TrainingConfig(BaseModel):
     """Everything that a run depends on but the data; written beside its checkpoints."""
 
@@ -64,8 +68,8 @@ class TrainingConfig(BaseModel):
     expected under their probabilities; as released, 0. The likelihood alone leaves it open which mode is the
     likeliest: this asks that it be a near one."""
     displacement_after: int = Field(default=0, ge=0)
-    """Epochs without it: with it from the start, modes come to lie on each other before they have learned to
-    differ."""
+    """Epochs without it, at most half of them, and none after a ``start``: with it from the beginning, modes
+    come to lie on each other before they have learned to differ."""
     learning_rate: float = Field(gt=0)
     """At the first step; decays by ``learning_rate_decay`` a step, not below ``least_learning_rate``."""
     learning_rate_decay: float = Field(default=0.9999, gt=0, le=1)
@@ -95,6 +99,10 @@ class TrainingConfig(BaseModel):
     def _network_fits_method(self) -> "TrainingConfig":
         if isinstance(self.network, CoverNetConfig) is not (self.method is Method.COVERNET):
             raise ValueError(f"a network of kind {self.network.kind} does not learn by {self.method.value}")
+        if self.method in BLIND and not self.network.supports_blind:
+            raise ValueError(
+                f"network: blind is none, but {self.method.value} learns to forecast blindly, too"
+            )
         return self
 
     @model_validator(mode="after")
@@ -108,6 +116,11 @@ class TrainingConfig(BaseModel):
         if self.cooldown_epochs > self.epochs:
             raise ValueError(f"cooldown_epochs {self.cooldown_epochs} is more than epochs {self.epochs}")
         return self
+
+    @property
+    def epochs_apart(self) -> int:
+        """Epochs without the displacement: see ``displacement_after``."""
+        return 0 if self.start is not None else min(self.displacement_after, self.epochs // 2)
 
     def toml(self) -> str:
         """The settings as a file for ``load_config``; what is given on the command line is left out."""
@@ -138,10 +151,10 @@ def load_config(
     Args:
         method: whose.
         file: TOML to take them from instead of the one that comes with the package.
-        published: train as the released code does; of the file, its table ``published``, description and
-            network count.
+        published: train as the released code does, but for ``calibrate`` and ``precision``; of the file, its
+            table ``published``, description and network (without ``max_control_sigma``) count.
         changes: single settings that go before the file's; None counts as not given. Of fewer epochs than are
-            to cool down all cool down, and half have the displacement.
+            to cool down, all cool down.
 
     Raises:
         TrainingError: the file is missing or wrong, naming it and the setting.
@@ -155,7 +168,7 @@ def load_config(
         if published:
             values = _as_published(values, released, str(source))
         given: dict[str, Any] = {name: value for name, value in changes.items() if value is not None}
-        config = TrainingConfig.model_validate({"method": method, **values, **_shortened(values, given)})
+        config = TrainingConfig.model_validate({"method": method, **values, **_cooled(values, given)})
     except OSError as error:
         raise TrainingError(f"{source}: cannot be read: {error.strerror}") from error
     except ValidationError as error:
@@ -172,21 +185,17 @@ def _as_published(values: Mapping[str, Any], released: object, source: str) -> d
     """Of a file's values what the method is, with the file's table of what the released code has."""
     if not isinstance(released, dict):
         raise TrainingError(f"{source}: has no table [published]")
+    if strange := released.keys() & {"method", "description", "network", "start"}:
+        raise TrainingError(f"{source}: published: {', '.join(sorted(strange))} cannot be there")
     kept = {name: values[name] for name in ("description", "network") if name in values}
     if isinstance(network := kept.get("network"), dict):
         kept["network"] = {name: value for name, value in network.items() if name != "max_control_sigma"}
     return {**released, **kept}
 
 
-def _shortened(values: Mapping[str, Any], given: dict[str, Any]) -> dict[str, Any]:
-    """What is given; where it makes fewer epochs than a file's phases take, these are shortened."""
-    epochs = given.get("epochs")
-    if not isinstance(epochs, int):
-        return given
-    most = {"cooldown_epochs": epochs, "displacement_after": epochs // 2}
-    phases = {
-        name: min(length, most[name])
-        for name, length in values.items()
-        if name in most and isinstance(length, int)
-    }
-    return {**phases, **given}
+def _cooled(values: Mapping[str, Any], given: dict[str, Any]) -> dict[str, Any]:
+    """What is given; where it makes fewer epochs than the file cools down, they all do."""
+    cooling, epochs = values.get("cooldown_epochs"), given.get("epochs")
+    if isinstance(cooling, int) and isinstance(epochs, int) and epochs < cooling:
+        return {"cooldown_epochs": epochs, **given}
+    return given

@@ -1,5 +1,6 @@
 """The training loop."""
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -86,6 +87,9 @@ class Trainer:
         Args:
             report: called after each epoch, in the first process only.
             tick: called after each step.
+
+        Raises:
+            TrainingError: the run has diverged; what was saved before is still there.
         """
         while self.progress.epoch < self.config.epochs:
             figures = self._epoch(tick)
@@ -108,7 +112,12 @@ class Trainer:
     def _judge(self) -> dict[str, float]:
         networks = self._judged().eval()
         figures = self._validate(networks)
-        score = figures[SCORE]
+        score = figures.get(SCORE, math.nan)
+        if not math.isfinite(score):
+            raise TrainingError(
+                f"the run has diverged: after epoch {self.progress.epoch} no forecast is a number; a smaller "
+                "learning rate may help"
+            )
         if self.progress.best_score is None or score < self.progress.best_score:
             self.progress = replace(self.progress, best_epoch=self.progress.epoch, best_score=score)
             self._keep_best()
@@ -160,7 +169,7 @@ class Trainer:
     def _step(self, batches: Sequence[Batch]) -> dict[str, Tensor]:
         step = self.progress.step
         annealed = step if self.config.start is None else step + ANNEALED
-        asked = self.progress.epoch >= self.config.displacement_after
+        asked = self.progress.epoch >= self.config.epochs_apart
         displacement = self.config.displacement_weight if asked else 0.0
         weights = Weights(
             self.config.kl_weight * KL_SHARE(annealed),

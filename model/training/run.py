@@ -18,7 +18,7 @@ from model.forecaster import ModelInfo, Protocol
 from model.scene import AgentType
 from model.training import processes
 from model.training.calibration import calibrate, fit_calibration
-from model.training.card import LICENSE, Origin, model_card
+from model.training.card import LICENSE, RAN_AWAY, Origin, model_card
 from model.training.config import TrainingConfig
 from model.training.logs import RunLog
 from model.training.loop import Report, Trainer
@@ -150,7 +150,7 @@ class Run:
             calibration = fit_calibration(vehicles, train)
             calibrate(vehicles, calibration)
             if calibration.ran_away:
-                said(f"the calibration ran to a bound, look at the figures: {calibration}")
+                said(f"calibration{RAN_AWAY}")
         figures = validation.judge(trainer.networks, samples=SAMPLES, draws=DRAWS)
         begun = "" if config.start is None else f"; begun with {config.start}"
         info = ModelInfo(

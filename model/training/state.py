@@ -1,11 +1,13 @@
 """Where a run stands, on disk: parameters and optimiser as safetensors, the rest as JSON. No pickles."""
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
+from pydantic import ValidationError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
@@ -114,18 +116,24 @@ def _parameter_names(learner: Learner) -> dict[torch.nn.Parameter, str]:
 
 
 def _check_same(file: Path, saved: Mapping[str, object], config: TrainingConfig, done: int) -> None:
-    now = config.model_dump(mode="json")
-    other = {k for k in now if k != "epochs" and saved.get(k) != now[k]}
-    # More or fewer epochs are no other setting until the end's cooling has begun
-    shortest = min(int(str(saved.get("epochs", 0))), config.epochs)
-    if (
-        config.cooldown_epochs
-        and saved.get("epochs") != config.epochs
-        and done > shortest - config.cooldown_epochs
-    ):
+    try:
+        before = TrainingConfig.model_validate(saved)  # what is newer than the run has its default
+    except ValidationError as error:
+        names = ", ".join(".".join(map(str, one["loc"])) for one in error.errors())
+        raise TrainingError(f"{file}: is of a run with settings that there are no more: {names}") from error
+    other = {name for name, value in config if name != "epochs" and getattr(before, name) != value}
+    if before.epochs != config.epochs and done > _settled(before, config):
         other.add("epochs")
     if other:
         raise TrainingError(f"{file}: is of a run with other settings: {', '.join(sorted(other))}")
+
+
+def _settled(before: TrainingConfig, now: TrainingConfig) -> float:
+    """How many epochs may have been done before it makes a difference of how many they are."""
+    both = (before, now)
+    cooling = min(each.epochs - each.cooldown_epochs if each.cooldown_epochs else math.inf for each in both)
+    apart = {each.epochs_apart for each in both} if now.displacement_weight else set()
+    return min(cooling, *apart) if len(apart) > 1 else cooling
 
 
 def _under(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

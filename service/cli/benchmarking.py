@@ -87,9 +87,9 @@ def show_benchmark(
     write_instances(out, judged.each)
     with replacing(out / TABLES_FILE) as temporary:
         temporary.write_text(markdown(results), encoding="utf-8")
-    if whole.protocol is Protocol.CAUSAL and whole.judging.consistency:
+    if whole.protocol is Protocol.CAUSAL and results.limit is None and (text := rules(results)):
         with replacing(out / RULES_FILE) as temporary:
-            temporary.write_text(rules(results), encoding="utf-8")
+            temporary.write_text(text, encoding="utf-8")
     page = _page(whole, results, judged.mismatch_m, out, console)
     written = [*([] if page is None else [page]), *_submissions(whole, models, out, console)]
     show_tables(tables(results), out)

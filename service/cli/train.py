@@ -28,7 +28,8 @@ def register(app: typer.Typer) -> None:
         cache: Annotated[Path | None, typer.Option(help="Folder of caches; default: OUT/cache.")] = None,
         config: Annotated[Path | None, typer.Option(help="TOML; default: the method's own.")] = None,
         published: Annotated[
-            bool, typer.Option("--published", help="Train as the authors' released code does.")
+            bool,
+            typer.Option("--published", help="Objective, rates and epochs of the authors' released code."),
         ] = False,
         epochs: Annotated[int | None, typer.Option(min=1, help="Goes before the TOML's.")] = None,
         learning_rate: Annotated[float | None, typer.Option(help="Goes before the TOML's.")] = None,
@@ -60,7 +61,7 @@ def register(app: typer.Typer) -> None:
             kind, path = parse_data(data)
             source = Source(kind, path, train_split, validation_split, parse_protocol(protocol))
             default = "1.0.0+paper" if source.protocol is Protocol.PAPER else "1.0.0"
-            settings = load_config(parse_method(method), config, published, **changes)
+            settings = load_config(parse_method(method), config, published=published, **changes)
             show_training(Run(settings, source, out, cache or out / "cache", version or default, begun))
         except (TrainingError, DataError, CheckpointError) as error:
             fail(str(error))

@@ -41,7 +41,13 @@ def test_what_was_not_measured_is_not_compared_with() -> None:
 
 def test_live_figures_do_not_tell_versions_apart() -> None:
     old, new = made_model("cab", "1.0.0"), made_model("cab", "1.1.0", metrics=made_metrics(2.0))
-    assert read(made_results(old, new)) == [_dispersion("cab", "4.00"), _convergence("cab", "0.50")]
+    paper = made_model("cab", "2.0.0+paper", "paper", made_metrics(3.0))
+    for models in ((old, new), (new, old), (new, paper, old)):
+        assert read(made_results(*models)) == [_dispersion("cab", "4.00"), _convergence("cab", "0.50")]
+
+
+def test_without_any_figure_there_is_no_file() -> None:
+    assert rules(made_results(made_model("cab", metrics={"nll": 1.0}), made_oracle())) == ""
 
 
 def test_it_says_what_it_is_of() -> None:

@@ -1,5 +1,6 @@
 """The loop: learns, resumes exactly, keeps the best."""
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -238,6 +239,32 @@ def test_the_best_epoch_is_kept(tmp_path: Path) -> None:
     assert torch.equal(trainer.best()[name], kept[1])
 
 
+def test_of_how_many_epochs_half_have_no_displacement_is_then_fixed(tmp_path: Path) -> None:
+    def config(epochs: int, after: int = 2) -> TrainingConfig:
+        return small_config(epochs=epochs, displacement_weight=1.0, displacement_after=after)
+
+    assert [config(epochs).epochs_apart for epochs in (1, 2, 3, 4, 9)] == [0, 1, 1, 2, 2]
+    assert config(9).model_copy(update={"start": "cab@1.0.0 (causal)"}).epochs_apart == 0
+    train(config(2), tmp_path)
+    with pytest.raises(TrainingError, match="other settings: epochs"):
+        train(config(4), tmp_path)
+    assert len(train(config(3), tmp_path)[1]) == 1
+
+
+def test_settings_that_a_run_did_not_know_have_their_defaults(tmp_path: Path) -> None:
+    train(small_config(epochs=1), tmp_path)
+    file = tmp_path / "state.json"
+    state = json.loads(file.read_text())
+    del state["config"]["displacement_after"], state["config"]["network"]["max_control_sigma"]
+    file.write_text(json.dumps(state))
+    assert len(train(small_config(epochs=2), tmp_path)[1]) == 1
+    state = json.loads(file.read_text())
+    state["config"]["no_more"] = 1
+    file.write_text(json.dumps(state))
+    with pytest.raises(TrainingError, match="settings that there are no more: no_more"):
+        train(small_config(epochs=2), tmp_path)
+
+
 def test_a_run_with_other_settings_is_not_resumed(tmp_path: Path) -> None:
     train(small_config(epochs=1), tmp_path)
     with pytest.raises(TrainingError, match="other settings: learning_rate"):
@@ -275,8 +302,9 @@ def test_every_method_is_trained_as_published_on_request(method: Method) -> None
 def test_a_short_run_has_short_phases() -> None:
     whole, short = load_config(Method.CAB), load_config(Method.CAB, epochs=3)
     assert whole.cooldown_epochs > 3
-    assert whole.displacement_after > 1
-    assert (short.cooldown_epochs, short.displacement_after) == (3, 1)
+    assert whole.epochs_apart > 1
+    assert (short.cooldown_epochs, short.epochs_apart) == (3, 1)
+    assert load_config(Method.CAB, epochs=3, cooldown_epochs=1).cooldown_epochs == 1
     more = load_config(Method.CAB, epochs=whole.epochs + 1)
     assert more == whole.model_copy(update={"epochs": whole.epochs + 1})
     assert load_config(Method.CAB, epochs=3, cooldown_epochs=1).cooldown_epochs == 1
@@ -306,6 +334,9 @@ def test_wrong_settings_are_named(tmp_path: Path) -> None:
         load_config(Method.CAB, tmp_path / "nowhere.toml")
     file.write_text(load_config(Method.CAB).toml())
     with pytest.raises(TrainingError, match=r"has no table \[published\]"):
+        load_config(Method.CAB, file, published=True)
+    file.write_text("[published]\nstart = 'x'\n[published.network]\nmodes = 3\n")
+    with pytest.raises(TrainingError, match="published: network, start cannot be there"):
         load_config(Method.CAB, file, published=True)
     file.write_text('description = ""\nlearning_rate = 1\n[network]\nkind = "covernet"\n')
     with pytest.raises(TrainingError, match="of kind covernet does not learn by cab"):

@@ -16,6 +16,7 @@ from model.networks.config import CoverNetConfig
 from model.registry import Registry
 from model.scene import AgentType
 from model.training.calibration import MOST, Calibration
+from model.training.card import RAN_AWAY
 from model.training.config import Method
 from model.training.logs import RunLog
 from model.training.run import Run, Source
@@ -75,6 +76,8 @@ def test_what_was_calibrated_is_in_the_checkpoint_and_on_its_card(run: Run, meth
     card = (folder / "README.md").read_text()
     assert f"standard deviations times {factor:.3f}" in card
     assert f"divided by {divisor:.3f}" in card
+    of_blind = [(shipped[name] - trained[name]).exp()[0].item() for name in blind]
+    assert (RAN_AWAY in card) is Calibration(factor, divisor, *of_blind).ran_away
     assert ("of blind forecasts" in card) is bool(blind)
 
 
@@ -82,8 +85,9 @@ def test_a_calibration_that_ran_away_is_said(run: Run, monkeypatch: pytest.Monke
     said: list[str] = []
     once = replace(run, config=small_config(Method.CAB, epochs=1))
     monkeypatch.setattr("model.training.run.fit_calibration", lambda *_: Calibration(1.0, MOST))
-    once.train(lambda *_: None, lambda *_: None, said.append)
-    assert any("ran to a bound" in line and "temperature=100.0" in line for line in said)
+    folder = once.train(lambda *_: None, lambda *_: None, said.append)
+    assert any(RAN_AWAY in line for line in said)
+    assert RAN_AWAY in (folder / "README.md").read_text()
 
 
 def test_without_calibration_the_checkpoint_is_what_was_trained(run: Run) -> None:

@@ -157,6 +157,7 @@ def test_of_a_hundred_thousand_faults_one_an_agent_is_put_into_words(
     faults = read_agents(request, SETTINGS).faults
     assert faults[199].field == f"agents[199].states[0].{field}"
     assert put.call_count == 200
+    assert cpu_seconds(lambda: read_agents(request, SETTINGS)) < 1.0  # some 0.06 s
 
 
 def test_too_many_states() -> None:
