@@ -20,3 +20,13 @@ def replacing(file: Path) -> Iterator[Path]:
         temporary.replace(file)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def replace_text(file: Path, text: str) -> None:
+    """Writes a text in place of what was there.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    with replacing(file) as temporary:
+        temporary.write_text(text, encoding="utf-8")

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from benchmark import BenchmarkError
-from benchmark.files import replacing
+from benchmark.files import replace_text, replacing
 from model.arrays import Floats
 from model.evaluation.results import finite
 from model.forecaster import Protocol
@@ -133,8 +133,7 @@ class Results:
             OSError: it cannot be written.
         """
         text = json.dumps(finite(asdict(self)), indent=2, allow_nan=False) + "\n"
-        with replacing(folder / RESULTS_FILE) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        replace_text(folder / RESULTS_FILE, text)
 
     @classmethod
     def read(cls, folder: Path) -> "Results":

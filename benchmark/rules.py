@@ -36,24 +36,20 @@ _RULE: Final = """\
 
 
 def rules(results: Results) -> str:
-    """The file; empty where there is nothing to compare with.
+    """The file; empty where there is nothing to compare with: live inputs are of the causal protocol, and
+    figures of only the first pairs are no measure.
 
     Live figures do not tell versions of a model apart: the newest counts, which calls get that name none.
-
-    Args:
-        results: by the causal protocol, as live inputs are.
     """
+    if results.protocol is not Protocol.CAUSAL or results.limit is not None:
+        return ""
     asked = {one.key: one for one in results.models if one.version and one.protocol != Protocol.PAPER.value}
     models = {asked[key].name: asked[key] for key in oldest_first(asked)}
     dispersion = _rules(models, "forecast:benchmark_dispersion_meters", "dispersion_std_m")
     convergence = _rules(models, "forecast:benchmark_convergence_seconds", "convergence_1m_s", ', tau: "1"')
     if not dispersion + convergence:
         return ""
-    return _FILE.format(
-        statement=results.statement(),
-        dispersion=dispersion,
-        convergence=convergence,
-    )
+    return _FILE.format(statement=results.statement(), dispersion=dispersion, convergence=convergence)
 
 
 def _rules(models: Mapping[str, ModelResult], record: str, figure: str, labels: str = "") -> str:

@@ -81,7 +81,7 @@ mode on this same split.
 """
 
 
-RAN_AWAY = ". A number ran to the bound of the search: the likelihood asks for more of it than is reasonable"
+RAN_AWAY = "a number ran to the bound of its search: the likelihood asks for more of it than is reasonable"
 """Said of such a calibration, on the card and while training."""
 
 
@@ -95,5 +95,5 @@ def _calibration(calibration: Calibration | None) -> str:
         f"{calibration.temperature:.3f}, fitted after training, so that training positions are the "
         "likeliest. Means and the order of the modes are the network's own; their probabilities are nearer "
         "to each other than it had learned them where the divisor is above 1"
-        f"{RAN_AWAY if calibration.ran_away else ''}"
+        f"{f'; {RAN_AWAY}' if calibration.ran_away else ''}"
     )

@@ -150,7 +150,7 @@ class Run:
             calibration = fit_calibration(vehicles, train)
             calibrate(vehicles, calibration)
             if calibration.ran_away:
-                said(f"calibration{RAN_AWAY}")
+                said(f"calibration: {RAN_AWAY}")
         figures = validation.judge(trainer.networks, samples=SAMPLES, draws=DRAWS)
         begun = "" if config.start is None else f"; begun with {config.start}"
         info = ModelInfo(

@@ -24,7 +24,7 @@ from rich.text import Text
 from benchmark import BenchmarkError
 from benchmark.answers import read_answers
 from benchmark.archive import Archive
-from benchmark.files import replacing
+from benchmark.files import replace_text
 from benchmark.models import choose, key, unfit
 from benchmark.replay import RETRIES
 from benchmark.results import Results, write_instances
@@ -35,7 +35,6 @@ from benchmark.tables import left_out, markdown, tables
 from cab.forecast.v1.model_service_pb2 import Model
 from cab_forecast import AsyncClient
 from model.arrays import Floats
-from model.forecaster import Protocol
 from service.cli.tables import show_tables
 
 TABLES_FILE = "tables.md"
@@ -85,11 +84,9 @@ def show_benchmark(
     out.mkdir(parents=True, exist_ok=True)
     results.write(out)
     write_instances(out, judged.each)
-    with replacing(out / TABLES_FILE) as temporary:
-        temporary.write_text(markdown(results), encoding="utf-8")
-    if whole.protocol is Protocol.CAUSAL and results.limit is None and (text := rules(results)):
-        with replacing(out / RULES_FILE) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+    replace_text(out / TABLES_FILE, markdown(results))
+    if text := rules(results):
+        replace_text(out / RULES_FILE, text)
     page = _page(whole, results, judged.mismatch_m, out, console)
     written = [*([] if page is None else [page]), *_submissions(whole, models, out, console)]
     show_tables(tables(results), out)

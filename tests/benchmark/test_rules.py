@@ -1,12 +1,14 @@
 """A benchmark's figures as rules that Prometheus reads."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import yaml
 
 from benchmark.results import Results
 from benchmark.rules import RULES_FILE, rules
+from model.forecaster import Protocol
 from tests.benchmark.builders import made_metrics, made_model, made_oracle, made_results
 from tests.deploy.files import PROMETHEUS, read_yaml
 
@@ -48,6 +50,11 @@ def test_live_figures_do_not_tell_versions_apart() -> None:
 
 def test_without_any_figure_there_is_no_file() -> None:
     assert rules(made_results(made_model("cab", metrics={"nll": 1.0}), made_oracle())) == ""
+
+
+def test_what_live_figures_cannot_be_compared_with_is_in_no_file() -> None:
+    assert rules(made_results(protocol=Protocol.PAPER)) == ""
+    assert rules(replace(made_results(), limit=5)) == ""
 
 
 def test_it_says_what_it_is_of() -> None:
