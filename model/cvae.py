@@ -6,15 +6,23 @@ from torch import Tensor
 
 from model.forecaster import ModelInfo
 from model.network_forecaster import NetworkForecaster, Networks
-from model.networks.config import NetworkConfig
+from model.networks.agent_frame import AgentFrameNetwork
+from model.networks.config import Frame, NetworkConfig
 from model.networks.network import AgentNetwork
+from model.scene import AgentType
 
 
-class CvaeNetworks(Networks[AgentNetwork]):
+class CvaeNetworks(Networks[AgentNetwork | AgentFrameNetwork]):
     """The networks of a CVAE."""
 
     def __init__(self, config: NetworkConfig) -> None:
-        super().__init__(config, {kind: AgentNetwork(config, kind) for kind in config.agent_types})
+        if config.frame is Frame.AGENT:
+            networks: dict[AgentType, AgentNetwork | AgentFrameNetwork] = {
+                AgentType.VEHICLE: AgentFrameNetwork(config)
+            }
+        else:
+            networks = {kind: AgentNetwork(config, kind) for kind in config.agent_types}
+        super().__init__(config, networks)
 
 
 class CvaeForecaster(NetworkForecaster[CvaeNetworks]):

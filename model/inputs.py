@@ -2,10 +2,11 @@
 
 import torch
 
+from model.agent_features import agent_frame_features
 from model.arrays import Ints
 from model.features import scene_features
 from model.forecaster import Context, Features
-from model.networks.config import AnyNetworkConfig, NetworkConfig
+from model.networks.config import AnyNetworkConfig, Frame, NetworkConfig
 from model.scene import AgentType, Scene
 from model.surroundings import surroundings
 
@@ -16,9 +17,11 @@ def network_features(
     """Features of n agents of one type.
 
     Returns:
-        ``model.features.scene_features``; for CoverNet without neighbours' histories, but with
+        ``model.features.scene_features``, or in the agent's frame ``model.agent_features``; for CoverNet without neighbours' histories, but with
         ``surroundings`` [n, S, 5] float32 (``model.surroundings``), if it draws any and with full context.
     """
+    if isinstance(config, NetworkConfig) and config.frame is Frame.AGENT:
+        return agent_frame_features(scene, targets, config, context)
     if isinstance(config, NetworkConfig):
         return scene_features(scene, targets, agent_type, config, context)
     alone = NetworkConfig(neighbor_types=(), uses_map=config.uses_map)

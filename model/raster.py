@@ -7,6 +7,7 @@ columns to the left.
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -25,12 +26,35 @@ ROWS_BEHIND = 10
 COLUMNS_RIGHT = 50
 """The agent's column: 50 columns (16.7 m) lie to its right, 50 to its left."""
 
-_REACH = math.hypot(PATCH_SIZE - ROWS_BEHIND, PATCH_SIZE - COLUMNS_RIGHT)
-"""No pixel of a patch is farther from its agent, patch pixels."""
+
+@dataclass(frozen=True)
+class PatchGeometry:
+    """Where the pixels of a square patch lie in its agent's frame: element (i, j) shows the point
+    (i − rows_behind, j − columns_right) / pixels_per_meter ahead and to the left of the agent."""
+
+    size: int
+    """Rows and columns."""
+    pixels_per_meter: float
+    rows_behind: int
+    columns_right: int
+
+    @property
+    def reach(self) -> float:
+        """Pixels from the agent to the farthest corner."""
+        return math.hypot(self.size - self.rows_behind, self.size - self.columns_right)
 
 
-def cut_patches(raster: Raster, position: Floats, heading: Floats) -> Float32s:
-    """Map patches of N agents, bilinear between raster pixels, zero outside the raster.
+NEAR = PatchGeometry(PATCH_SIZE, PATCH_PIXELS_PER_METER, ROWS_BEHIND, COLUMNS_RIGHT)
+"""30 m ahead, 3.3 m behind, 16.7 m to each side."""
+FAR = PatchGeometry(PATCH_SIZE, 1.4, 14, 50)
+"""61 m ahead, 10 m behind, 36 m to each side: no corner is farther than 74 m, where recorded rasters end
+(beyond it they would tell where nobody goes)."""
+
+
+def cut_patches(
+    raster: Raster, position: Floats, heading: Floats, geometry: PatchGeometry = NEAR, outside: float = 0.0
+) -> Float32s:
+    """Return map patches of N agents, bilinear between raster pixels.
 
     A raster of twice the patch's resolution or more is first brought near it, so that thin lines stay.
 
@@ -40,9 +64,11 @@ def cut_patches(raster: Raster, position: Floats, heading: Floats) -> Float32s:
         raster: the scene's map, any resolution.
         position: [N, 2], m, ground frame.
         heading: [N], rad.
+        geometry: where a patch's pixels lie.
+        outside: what pixels outside the raster are.
 
     Returns:
-        [N, 3, 100, 100] in [0, 1].
+        [N, 3, S, S] in [0, 1].
 
     Raises:
         ValueError: a position or heading is not finite.
@@ -51,29 +77,33 @@ def cut_patches(raster: Raster, position: Floats, heading: Floats) -> Float32s:
     if not (np.isfinite(position).all() and np.isfinite(heading).all()):
         raise ValueError("a map patch needs a finite position and heading")
     layers, rows, columns = raster.layers.shape
-    patches = np.zeros((count, layers, PATCH_SIZE, PATCH_SIZE), dtype=np.float32)
+    patches = np.full((count, layers, geometry.size, geometry.size), outside, dtype=np.float32)
     # Raster pixels, from here on; (row, column) go with ground (x, y).
     center = (position - raster.origin) * raster.pixels_per_meter
-    reach = _REACH * raster.pixels_per_meter / PATCH_PIXELS_PER_METER + 1
+    zoom = raster.pixels_per_meter / geometry.pixels_per_meter
+    reach = geometry.reach * zoom + 1
     on_map = ((center > -reach) & (center < np.array([rows, columns]) - 1 + reach)).all(axis=1)
     if not (on_map.any() and raster.layers.size):
         return patches
     # Only the part that the agents can see is turned into floats.
     low = np.maximum(np.floor(center[on_map].min(axis=0) - reach), 0).astype(np.int64)
     high = np.minimum(np.ceil(center[on_map].max(axis=0) + reach) + 1, [rows, columns]).astype(np.int64)
-    factor = max(int(raster.pixels_per_meter / PATCH_PIXELS_PER_METER), 1)
+    factor = max(int(zoom), 1)
     pixels = _coarsened(raster.layers[:, low[0] : high[0], low[1] : high[1]], factor)
+    if outside:  # one layer more, which tells how much of a sample lies on the raster
+        pixels = np.concatenate([pixels, np.ones_like(pixels[:1])])
     crop = torch.from_numpy(pixels.astype(np.float32))
     # Of coarser pixels, whose middle is that of those that they are made of
     coarse = (center[on_map] - low - (factor - 1) / 2) / factor
-    scale = raster.pixels_per_meter / PATCH_PIXELS_PER_METER / factor
     seen = functional.grid_sample(
         crop.expand(int(on_map.sum()), -1, -1, -1),  # no copy: all agents read the same pixels
-        _grid(scale, coarse, heading[on_map], (crop.shape[1], crop.shape[2])),
+        _grid(zoom / factor, coarse, heading[on_map], (crop.shape[1], crop.shape[2]), geometry),
         mode="bilinear",
         padding_mode="zeros",
         align_corners=False,
     )
+    if outside:
+        seen = seen[:, :layers] + outside * (1 - seen[:, layers:])
     if on_map.all():
         return seen.numpy()
     patches[on_map] = seen.numpy()
@@ -90,29 +120,35 @@ def _coarsened(layers: Bytes, factor: int) -> Bytes:
     count, rows, columns = layers.shape
     padded = np.zeros((count, -(-rows // factor) * factor, -(-columns // factor) * factor), dtype=np.uint8)
     padded[:, :rows, :columns] = layers
-    split = padded.reshape(count, padded.shape[1] // factor, factor, padded.shape[2] // factor, factor)
-    coarse: Bytes = split.max(axis=(2, 4))
+    # By slices, as a maximum over two axes of a reshaped array takes ten times as long
+    coarse = padded[:, ::factor, ::factor].copy()
+    for row in range(factor):
+        for column in range(factor):
+            np.maximum(coarse, padded[:, row::factor, column::factor], out=coarse)
     return coarse
 
 
-def _grid(scale: float, center: Floats, heading: Floats, shape: tuple[int, int]) -> Tensor:
-    """Where each patch pixel lies, in the coordinates of ``grid_sample`` (column first, ∓1 half a pixel
-    outside the outermost pixels): [N, 100, 100, 2].
+def _grid(
+    scale: float, center: Floats, heading: Floats, shape: tuple[int, int], geometry: PatchGeometry
+) -> Tensor:
+    """Return where each patch pixel lies, in the coordinates of ``grid_sample`` (column first, ∓1 half a
+    pixel outside the outermost pixels): [N, S, S, 2].
 
     Args:
         scale: pixels of what is sampled to a pixel of the patch.
         center: [N, 2], the agents, pixels.
         heading: [N], rad.
         shape: rows and columns of what is sampled.
+        geometry: of the patch.
     """
     cos, sin = scale * np.cos(heading), scale * np.sin(heading)
     # pixel = center + i' (cos, sin) + j' (−sin, cos), with i' and j' counted from the agent's row, column.
     ahead, left = np.stack([sin, cos], axis=-1), np.stack([cos, -sin], axis=-1)  # [N, (column, row)]
     half = np.array([shape[1], shape[0]]) / 2
     start = _float32((center[:, ::-1] + 0.5) / half - 1)[:, None]
-    index = torch.arange(PATCH_SIZE, dtype=torch.float32)[:, None]
-    along = start + (index - ROWS_BEHIND) * _float32(ahead / half)[:, None]  # [N, 100, 2]
-    across = (index - COLUMNS_RIGHT) * _float32(left / half)[:, None]
+    index = torch.arange(geometry.size, dtype=torch.float32)[:, None]
+    along = start + (index - geometry.rows_behind) * _float32(ahead / half)[:, None]  # [N, S, 2]
+    across = (index - geometry.columns_right) * _float32(left / half)[:, None]
     return along[:, :, None] + across[:, None]
 
 

@@ -96,6 +96,8 @@ class Scene:
     raster: Raster | None = None
     patches: dict[int, Bytes | Float32s] = field(default_factory=dict)
     """Agents' own map patches by agent index, each [3, 100, 100] in [0, 1]; they go before the raster."""
+    far_patches: dict[int, Bytes | Float32s] = field(default_factory=dict)
+    """Likewise of their far map patches."""
 
     def of_type(self, kind: AgentType) -> Bools:
         """[N], which agents are of that type."""

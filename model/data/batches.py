@@ -1,17 +1,20 @@
 """Batches of a cache's pairs on a device, as ``model.inputs`` would make them."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from model.data.cache import Cache
-from model.data.cache_layout import draws, neighbors_name
+from model.data.cache_layout import draws, in_agent_frame, neighbors_name
+from model.data.packing import unpack_patches
 from model.data.patches import PatchCutter
 from model.data.rotation import rotate
 from model.data.scenes import DataError
 from model.forecaster import Features
 from model.geometry import rotate as rotate_vectors
-from model.networks.config import AnyNetworkConfig
+from model.networks.config import AnyNetworkConfig, NetworkConfig
 from model.scene import AgentType
 
 
@@ -36,13 +39,24 @@ class Batches:
         if wanted and config is not None and key.drawn != draws(config):
             held = "boxes" if key.drawn else "summed histories"
             raise DataError(f"the cache holds neighbours as {held}, which this network does not take")
+        if config is not None and key.agent_frame != in_agent_frame(config):
+            held = "the agents' own frames" if key.agent_frame else "the ground frame"
+            raise DataError(f"the cache holds features in {held}, which this network does not take")
+        self.variants = key.variants
         arrays = {
             "origin": cache.position,
             "velocity": cache.velocity,
             "history": cache.history,
             "first": cache.first,
         }
-        if wanted and cache.surroundings is not None:
+        self._packed: dict[str, Tensor] = {}
+        if key.agent_frame:
+            arrays |= {"heading": cache.heading, "speed": cache.speed}
+            del arrays["velocity"]
+            if wanted:
+                arrays["neighbors"] = cache.agents
+            self._packed = _packed_patches(cache, config, device)
+        elif wanted and cache.surroundings is not None:
             arrays["surroundings"] = cache.surroundings
         elif wanted:
             arrays |= {neighbors_name(kind): cache.neighbors[kind] for kind in wanted}
@@ -50,16 +64,16 @@ class Batches:
         # The arrays are small: in memory, a batch costs no page faults
         self._arrays = {name: torch.from_numpy(np.array(array)).to(device) for name, array in arrays.items()}
         self._future = torch.from_numpy(np.array(cache.future)).to(device)
-        self._turned = torch.from_numpy(np.array(cache.turn))
+        self._turned = torch.from_numpy(np.array(cache.turn))[:: 1 + key.variants]
         paths = rotate_vectors(cache.future.astype(np.float64), -cache.heading[:, None])
         self._paths = torch.from_numpy(paths.astype(np.float32))
         looks = config is None or config.looks_at_map(AgentType.VEHICLE)
-        self._cut = PatchCutter(cache, device) if looks else None
+        self._cut = PatchCutter(cache, device) if looks and not key.agent_frame else None
         self._device = device
 
     def __len__(self) -> int:
         """P, how many pairs there are."""
-        return len(self._future)
+        return len(self._future) // (1 + self.variants)
 
     @property
     def turned(self) -> Tensor:
@@ -75,17 +89,20 @@ class Batches:
         """``features``, with the surroundings of each pair turned.
 
         Args:
-            indices: [n] int64, each in [0, P), on any device.
+            indices: [n] int64, each in [0, P), on any device. Of a pair with variants one row is drawn.
             turns: [n] rad, counter-clockwise, on any device; None: not at all.
         """
+        if self.variants:
+            rows = 1 + self.variants
+            indices = indices * rows + torch.randint(rows, indices.shape, device=indices.device)
         features, future = self.features(indices)
         return (features, future) if turns is None else rotate(features, future, turns.to(self._device))
 
     def features(self, indices: Tensor) -> tuple[Features, Tensor]:
-        """Features and futures of pairs.
+        """Return features and futures of rows of the cache: the pairs, and behind each its variants.
 
         Args:
-            indices: [n] int64, each in [0, P), on any device.
+            indices: [n] int64, on any device.
 
         Returns:
             The features of ``model.inputs.network_features`` with full context, patches included, and the
@@ -95,4 +112,55 @@ class Batches:
         features = {name: array.index_select(0, indices) for name, array in self._arrays.items()}
         if self._cut is not None:
             features["map"] = self._cut(indices)
+        for name, packed in self._packed.items():
+            # On a CPU the file is read as it is needed
+            here = packed[indices.cpu()].to(self._device)
+            features[name] = unpack_patches(here)
         return features, self._future.index_select(0, indices)
+
+
+def _packed_patches(cache: Cache, config: AnyNetworkConfig | None, device: torch.device) -> dict[str, Tensor]:
+    """Return the packed map patches that a network of the agent's frame looks at, by feature."""
+    near = config is None or config.uses_map
+    far = config is None or (isinstance(config, NetworkConfig) and config.far_map)
+    arrays = {"map": cache.near_patch if near else None, "far_map": cache.far_patch if far else None}
+    return {name: torch.from_numpy(array) for name, array in arrays.items() if array is not None}
+
+
+class JoinedPairs:
+    """The pairs of several sources, one source behind the other; a ``BatchSource``.
+
+    Args:
+        sources: at least one, whose features have the same names.
+    """
+
+    def __init__(self, sources: Sequence[Batches]) -> None:
+        self._sources = tuple(sources)
+        self._starts = np.cumsum([0, *(len(one) for one in sources)]).tolist()
+
+    def __len__(self) -> int:
+        """Return P, over all sources."""
+        return int(self._starts[-1])
+
+    @property
+    def turned(self) -> Tensor:
+        """[P], as of ``Batches``."""
+        return torch.cat([one.turned for one in self._sources])
+
+    @property
+    def paths(self) -> Tensor:
+        """[P, 12, 2], as of ``Batches``."""
+        return torch.cat([one.paths for one in self._sources])
+
+    def batch(self, indices: Tensor, turns: Tensor | None = None) -> tuple[Features, Tensor]:
+        """Return features and futures as ``Batches.batch`` does, in the order of the indices."""
+        parts, places = [], []
+        for source, start in zip(self._sources, self._starts, strict=False):
+            place = ((indices >= start) & (indices < start + len(source))).nonzero()[:, 0]
+            if len(place):
+                parts.append(source.batch(indices[place] - start, None if turns is None else turns[place]))
+                places.append(place)
+        order = torch.cat(places).argsort().to(parts[0][1].device)
+        names = parts[0][0].keys()
+        features = {name: torch.cat([one[name] for one, _ in parts])[order] for name in names}
+        return features, torch.cat([future for _, future in parts])[order]

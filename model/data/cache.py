@@ -7,6 +7,7 @@ its place and moved there when it is whole.
 import json
 import shutil
 import uuid
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from model.agent_features import agent_frame_features
 from model.arrays import Bytes, Float32s, Floats, Ints
 from model.data.cache_layout import (
     FORMAT_VERSION,
@@ -31,13 +33,15 @@ from model.data.cache_layout import (
     pair_layout,
 )
 from model.data.checks import FUTURE_STEPS, check_pairs, check_raster
-from model.data.packing import pack, unpack
+from model.data.packing import pack, pack_patches, unpack
 from model.data.protocols import SceneFrames
 from model.data.scenes import DataError, Reader, SceneRecord
+from model.data.sensing import SensedFrames
 from model.forecaster import Context, Protocol
 from model.geometry import wrap_angle
 from model.inputs import network_features
-from model.networks.config import AnyNetworkConfig
+from model.networks.config import AnyNetworkConfig, Frame, NetworkConfig
+from model.raster import FAR, NEAR, cut_patches
 from model.scene import AgentType, Raster
 
 __all__ = ["Cache", "CacheKey", "build_cache"]
@@ -90,6 +94,14 @@ class Cache:
     """[S]."""
     surroundings: Float32s | None = None
     """[P, B, 5], neighbours as boxes (``model.surroundings``); None: not held."""
+    speed: Float32s | None = None
+    """[P], m/s along the heading now; this and what follows is held in the agents' frame only."""
+    agents: Float32s | None = None
+    """[P, M, 11], neighbours one by one (``model.agent_features``)."""
+    near_patch: Bytes | None = None
+    """[P, 100, 100], map patches of three layers a byte (``model.data.packing``)."""
+    far_patch: Bytes | None = None
+    """Likewise, of the far patches."""
 
     def __len__(self) -> int:
         """P."""
@@ -140,6 +152,7 @@ def build_cache(
     history_frames: int,
     folder: Path,
     progress: Callable[[SceneRecord], None] | None = None,
+    variants: int = 0,
 ) -> None:
     """Writes the cache of a split; one that is there already is replaced once the new one is whole.
 
@@ -151,14 +164,15 @@ def build_cache(
         history_frames: F, frames of history, now included.
         folder: where to; made, with its parents, where it does not exist.
         progress: called after each scene.
+        variants: V, noisy reports of each pair beside the recorded states (agent frame only).
 
     Raises:
         DataError: the data is bad, there are no pairs, or the folder holds something else.
     """
     if folder.exists() and not (folder / MANIFEST_FILE).is_file():
         raise DataError(f"{folder}: is there already and is no cache; it is left alone")
-    key = CacheKey.of(reader, split, protocol, config, history_frames)
-    # Patches are cut from the rasters in each batch
+    key = CacheKey.of(reader, split, protocol, config, history_frames, variants)
+    # Patches are cut from the rasters: in each batch, or in the agent's frame those of all variants at once
     config = config.model_copy(update={"uses_map": False})
     with _replacing(folder) as new:
         pairs: list[Arrays] = []
@@ -169,7 +183,8 @@ def build_cache(
             for record in reader.scenes(split):
                 check_pairs(record.name, record.tracks, record.pairs)
                 check_raster(record.name, record.raster)
-                pairs.append(_pair_arrays(record, len(names), protocol, config, history_frames))
+                make = _agent_frame_arrays if key.agent_frame else _pair_arrays
+                pairs.append(make(record, len(names), protocol, config, history_frames, variants))
                 scenes.append(_scene_arrays(record.raster, written))
                 names.append(record.name)
                 written += rasters.write(pack(record.raster).data)
@@ -190,8 +205,61 @@ def build_cache(
         (new / MANIFEST_FILE).write_text(manifest.model_dump_json(indent=2) + "\n", encoding="utf-8")
 
 
+def _agent_frame_arrays(
+    record: SceneRecord,
+    scene: int,
+    protocol: Protocol,
+    config: AnyNetworkConfig,
+    history_frames: int,
+    variants: int,
+) -> Arrays:
+    """Return the rows of a scene's pairs in the agents' frames, those of a pair one behind the other."""
+    network = NetworkConfig(frame=Frame.AGENT, uses_map=False)
+    recorded = SceneFrames(record, protocol, history_frames)
+    sensed = SensedFrames(record, history_frames, seed=zlib.crc32(record.name.encode()))
+    frame = np.array([pair.frame for pair in record.pairs], dtype=np.int64)
+    track = np.array([pair.track for pair in record.pairs], dtype=np.int64)
+    rows = 1 + variants
+    parts: list[Arrays] = []
+    for now in np.unique(frame):  # the pairs are in this order
+        reports = []
+        for variant in range(rows):
+            seen, tracks = sensed.at(int(now), variant) if variant else recorded.at(int(now))
+            targets = np.searchsorted(tracks, track[frame == now])
+            report = agent_frame_features(seen, targets, network, Context.FULL)
+            reports.append({name: tensor.numpy() for name, tensor in report.items()})
+        part: Arrays = {  # [pairs · rows, …]
+            name: np.stack([one[name] for one in reports], axis=1).reshape(-1, *reports[0][name].shape[1:])
+            for name in reports[0]
+        }
+        part["position"], part["agents"] = part.pop("origin"), part.pop("neighbors")
+        for name, geometry in (("near_patch", NEAR), ("far_patch", FAR)):
+            patches = cut_patches(record.raster, part["position"], part["heading"], geometry, outside=0.5)
+            part[name] = pack_patches(patches)
+        parts.append(part)
+    arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    future, turn = _paths(record, history_frames)
+    begun = np.array([record.tracks[pair.track].positions(np.array(pair.frame)) for pair in record.pairs])
+    arrays["future"] = np.repeat(future + begun[:, None], rows, axis=0) - arrays["position"][:, None]
+    of_pairs = {
+        "turn": turn,
+        "scene": np.full(len(frame), scene),
+        "track": track,
+        "frame": frame,
+        "token": np.array([pair.token.encode("ascii") for pair in record.pairs], dtype=np.bytes_),
+    }
+    arrays |= {name: np.repeat(values, rows, axis=0) for name, values in of_pairs.items()}
+    count = len(arrays["position"])
+    return arrays | {"velocity": np.zeros((count, 2)), "edge_mask": np.zeros(count)}
+
+
 def _pair_arrays(
-    record: SceneRecord, scene: int, protocol: Protocol, config: AnyNetworkConfig, history_frames: int
+    record: SceneRecord,
+    scene: int,
+    protocol: Protocol,
+    config: AnyNetworkConfig,
+    history_frames: int,
+    variants: int,
 ) -> Arrays:
     scenes = SceneFrames(record, protocol, history_frames)
     frame = np.array([pair.frame for pair in record.pairs], dtype=np.int64)

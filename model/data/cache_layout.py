@@ -7,12 +7,24 @@ from typing import TypeAlias
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from model import features, geometry, inputs, neighbors, raster, resample, standardization, surroundings
-from model.data import packing, protocols
+from model import (
+    agent_features,
+    features,
+    geometry,
+    inputs,
+    neighbors,
+    raster,
+    resample,
+    standardization,
+    surroundings,
+)
+from model.agent_features import NEIGHBOR_FEATURES, NEIGHBORS
+from model.data import packing, protocols, sensing
 from model.data.checks import FUTURE_STEPS
 from model.data.scenes import Reader
 from model.forecaster import Protocol
-from model.networks.config import AnyNetworkConfig, CoverNetConfig
+from model.networks.config import AnyNetworkConfig, CoverNetConfig, Frame, NetworkConfig
+from model.raster import PATCH_SIZE
 from model.scene import AgentType
 from model.standardization import STATE_SIZE
 from model.surroundings import BOX_NUMBERS, BOXES
@@ -24,6 +36,7 @@ RASTERS_FILE = "rasters.u8"
 
 _DERIVED_BY = (resample, features, neighbors, standardization, geometry, protocols, packing)
 _DRAWN_BY = (inputs, surroundings, raster)
+_IN_AGENT_FRAME_BY = (agent_features, raster, sensing)
 
 Layout: TypeAlias = dict[str, tuple[type[np.generic], tuple[int, ...]]]
 """Type and shape, without the first axis, of arrays by name."""
@@ -53,12 +66,34 @@ class CacheKey(BaseModel):
     """Of the network's configuration; little else of it changes the arrays, so methods share caches."""
     drawn: bool = False
     """Whether neighbours are held as boxes to be drawn (CoverNet) instead of as summed histories."""
+    agent_frame: bool = False
+    """Whether features are in the agents' own frames; such caches hold map patches and neighbours one by
+    one, whatever of them a network takes."""
+    variants: int = Field(default=0, ge=0)
+    """V, how many noisy reports of each pair (``model.data.sensing``) are held beside the recorded states."""
 
     @classmethod
     def of(
-        cls, reader: Reader, split: str, protocol: Protocol, config: AnyNetworkConfig, history_frames: int
+        cls,
+        reader: Reader,
+        split: str,
+        protocol: Protocol,
+        config: AnyNetworkConfig,
+        history_frames: int,
+        variants: int = 0,
     ) -> "CacheKey":
-        """The key of the cache that ``build_cache`` makes of the same arguments."""
+        """Return the key of the cache that ``build_cache`` makes of the same arguments."""
+        if in_agent_frame(config):
+            return cls(
+                reader=type(reader).__name__,
+                data=reader.place,
+                split=split,
+                protocol=protocol,
+                history_frames=history_frames,
+                neighbor_types=NetworkConfig().neighbor_types,
+                agent_frame=True,
+                variants=variants,
+            )
         return cls(
             reader=type(reader).__name__,
             data=reader.place,
@@ -72,7 +107,7 @@ class CacheKey(BaseModel):
     @property
     def summed_types(self) -> tuple[AgentType, ...]:
         """Types whose summed histories are held."""
-        return () if self.drawn else self.neighbor_types
+        return () if self.drawn or self.agent_frame else self.neighbor_types
 
 
 class Manifest(BaseModel):
@@ -85,6 +120,7 @@ class Manifest(BaseModel):
     """Digest of the code that the arrays come out of."""
     key: CacheKey
     pairs: int = Field(ge=1)
+    """Rows: each pair has one, and after it one for each of its variants."""
     scenes: tuple[str, ...]
     """Names; the array ``scene`` counts them."""
     raster_bytes: int = Field(ge=1)
@@ -111,7 +147,19 @@ def pair_layout(key: CacheKey) -> Layout:
         layout[neighbors_name(kind)] = (np.float32, (frames, STATE_SIZE[kind]))
     if key.drawn:
         layout["surroundings"] = (np.float32, (BOXES, BOX_NUMBERS))
+    if key.agent_frame:
+        layout |= {
+            "speed": (np.float32, ()),
+            "agents": (np.float32, (NEIGHBORS, NEIGHBOR_FEATURES)),
+            "near_patch": (np.uint8, (PATCH_SIZE, PATCH_SIZE)),
+            "far_patch": (np.uint8, (PATCH_SIZE, PATCH_SIZE)),
+        }
     return layout
+
+
+def in_agent_frame(config: AnyNetworkConfig) -> bool:
+    """Whether a network's features are in the agents' own frames."""
+    return isinstance(config, NetworkConfig) and config.frame is Frame.AGENT
 
 
 def draws(config: AnyNetworkConfig) -> bool:
@@ -127,6 +175,7 @@ def neighbors_name(kind: AgentType) -> str:
 def derivation(key: CacheKey) -> str:
     """Digest of the code that arrays come out of: a cache that other code has made is stale."""
     digest = hashlib.sha256()
-    for module in (*_DERIVED_BY, *(_DRAWN_BY if key.drawn else ())):
+    others = (*(_DRAWN_BY if key.drawn else ()), *(_IN_AGENT_FRAME_BY if key.agent_frame else ()))
+    for module in (*_DERIVED_BY, *others):
         digest.update(inspect.getsource(module).encode())
     return digest.hexdigest()

@@ -20,6 +20,7 @@ def open_cache(
     config: AnyNetworkConfig,
     history_frames: int,
     said: Callable[[str], None],
+    variants: int = 0,
 ) -> Cache:
     """The cache of a split, made first where it is not there or stale.
 
@@ -32,18 +33,19 @@ def open_cache(
         config: says which neighbours are looked at, and how.
         history_frames: F, frames of history, now included.
         said: told in words that a cache is made, and why.
+        variants: V, noisy reports of each pair (agent frame only).
 
     Raises:
         DataError: the data is bad, or there are no pairs.
     """
-    key = CacheKey.of(reader, split, protocol, config, history_frames)
-    kinds = "".join(one.value[0] for one in config.neighbor_types) or "none"
+    key = CacheKey.of(reader, split, protocol, config, history_frames, variants)
+    kinds = "".join(one.value[0] for one in key.neighbor_types) or "none"
     whose = hashlib.sha256(key.data.encode()).hexdigest()[:8]  # so that data sets do not replace each other's
-    drawn = "-drawn" * key.drawn
-    place = folder / f"{kind}-{whose}-{split}-{protocol.value}-{history_frames}-{kinds}{drawn}"
+    form = f"-agent{variants}" if key.agent_frame else "-drawn" * key.drawn
+    place = folder / f"{kind}-{whose}-{split}-{protocol.value}-{history_frames}-{kinds}{form}"
     try:
         return Cache.open(place, key)
     except DataError as error:
         said(f"making the cache of {split}: {error}")
-    build_cache(reader, split, protocol, config, history_frames, place)
+    build_cache(reader, split, protocol, config, history_frames, place, variants=variants)
     return Cache.open(place, key)

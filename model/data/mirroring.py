@@ -11,6 +11,9 @@ _SIDEWAYS = (1, 3, 5, HEADING, HEADING + 1)
 """Of a state: y, its velocity and acceleration; of a vehicle also heading and heading rate."""
 _BOX_SIDEWAYS = (1, 2)
 """Of a box: left of the agent, heading."""
+_NEIGHBOR_SIDEWAYS = (1, 3, 5, 7)
+"""Of a neighbour in the agent's frame: y, sine of the heading, velocity and acceleration along y."""
+_MAPS = ("map", "far_map")
 
 
 def mirror(features: Features, future: Tensor, chosen: Tensor) -> tuple[Features, Tensor]:
@@ -20,7 +23,7 @@ def mirror(features: Features, future: Tensor, chosen: Tensor) -> tuple[Features
     first, to the far right, for which there is none on the left, repeats the one beside it.
 
     Args:
-        features: of n vehicles, from ``scene_features`` or ``Batches``; left as they are.
+        features: of n vehicles, from ``network_features`` or ``Batches``; left as they are.
         future: [n, T, 2], relative to the position now.
         chosen: [n] bool, which of them.
 
@@ -34,10 +37,15 @@ def mirror(features: Features, future: Tensor, chosen: Tensor) -> tuple[Features
             mirrored[name] = _flip(values, _SIDEWAYS, sign)
     if "surroundings" in features:
         mirrored["surroundings"] = _flip(features["surroundings"], _BOX_SIDEWAYS, sign)
-    if "map" in features:
-        turned = features["map"].flip(-1)
-        turned = torch.cat([turned[..., :1], turned[..., :-1]], dim=-1)
-        mirrored["map"] = torch.where(chosen[:, None, None, None], turned, features["map"])
+    if "neighbors" in features:
+        mirrored["neighbors"] = _flip(features["neighbors"], _NEIGHBOR_SIDEWAYS, sign)
+    if "heading" in features:
+        mirrored["heading"] = features["heading"] * sign.to(features["heading"].dtype)
+    rows = chosen.nonzero()[:, 0]
+    for name in features.keys() & set(_MAPS):
+        turned = features[name][rows].flip(-1)
+        mirrored[name] = features[name].clone()
+        mirrored[name][rows] = torch.cat([turned[..., :1], turned[..., :-1]], dim=-1)
     return mirrored, _flip(future, _SIDEWAYS, sign)
 
 

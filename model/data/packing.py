@@ -6,7 +6,10 @@ pixel outside finds zeros there without being told where the raster ends.
 
 import numpy as np
 
-from model.arrays import Bytes
+import torch
+from torch import Tensor
+
+from model.arrays import Bytes, Float32s
 from model.scene import Raster
 
 LAYERS = 3
@@ -25,3 +28,46 @@ def unpack(packed: Bytes, rows: int, columns: int) -> Bytes:
     """[3, rows, columns], 0 or 1, of what ``pack`` made of a raster of that size."""
     bits = packed.reshape(rows + 2, columns + 2)[1:-1, 1:-1]
     return np.stack([bits >> layer & 1 for layer in range(LAYERS)])
+
+
+_LEVELS = 4
+"""Of a layer in a packed patch: 0, ⅓, ⅔, 1. Bilinear samples lie between 0 and 1 at edges only."""
+_UNKNOWN = 1 << 6
+"""Set where nothing is known."""
+
+
+def pack_patches(patches: Float32s) -> Bytes:
+    """Return patches with a pixel's layers in one byte: [N, S, S].
+
+    Args:
+        patches: [N, 3, S, S] in [0, 1]; ½ in all layers where nothing is known.
+    """
+    level = np.round(patches * (_LEVELS - 1)).astype(np.uint8)
+    packed = level[:, 0] | level[:, 1] << 2 | level[:, 2] << 4
+    packed[(np.abs(patches - 0.5) < 1e-3).all(axis=1)] = _UNKNOWN
+    result: Bytes = packed
+    return result
+
+
+def _table() -> Tensor:
+    """Return the layers [256, 3] of each byte, in [-1, 1]; 0 where nothing is known."""
+    byte = torch.arange(256)
+    layers = torch.stack([byte >> 2 * layer & 3 for layer in range(LAYERS)], dim=-1)
+    table = 2 * layers.float() / (_LEVELS - 1) - 1
+    table[byte >= _UNKNOWN] = 0.0
+    return table
+
+
+_TABLE = _table()
+
+
+def unpack_patches(packed: Tensor) -> Tensor:
+    """Return patches [N, 3, S, S] in [-1, 1], 0 unknown, of what ``pack_patches`` made (to ⅓ of a layer).
+
+    They are laid out channels last, which convolutions read quickest.
+
+    Args:
+        packed: [N, S, S] uint8.
+    """
+    layers = torch.nn.functional.embedding(packed.to(torch.int32), _TABLE.to(packed.device))
+    return layers.permute(0, 3, 1, 2)

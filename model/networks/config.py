@@ -25,6 +25,15 @@ class BlindContext(StrEnum):
     """A second latent and decoder on the history encoding (released Reweight and RUBiZ)."""
 
 
+class Frame(StrEnum):
+    """The frame that a network sees and forecasts in."""
+
+    GROUND = "ground"
+    """The client's ground frame, moved to the agent (published Trajectron++)."""
+    AGENT = "agent"
+    """The agent's own: moved to it and turned by its heading (``model.networks.agent_frame``)."""
+
+
 class NetworkConfig(BaseModel):
     """A CVAE for each agent type; they share no parameters."""
 
@@ -37,6 +46,13 @@ class NetworkConfig(BaseModel):
     """Types that are looked at; empty: no neighbours."""
     uses_map: bool = True
     """Whether vehicles look at the map; pedestrians never do (Trajectron++ for nuScenes)."""
+    frame: Frame = Frame.GROUND
+    """Frame of features and forecasts; checkpoints that do not say have the ground frame."""
+    far_map: bool = False
+    """Whether vehicles also look at a map patch that reaches as far as 6 s (agent frame only)."""
+    min_sigma_m: tuple[float, float] = (0.1, 0.3)
+    """m, standard deviation that no direction of a forecast goes below, at 1 s and at 6 s, linear between
+    (agent frame only)."""
     modes: int = Field(default=25, ge=1, le=255)
     """K, categories of the latent variable."""
     blind: BlindContext = BlindContext.NONE
@@ -50,6 +66,20 @@ class NetworkConfig(BaseModel):
         for kind in (*self.agent_types, *self.neighbor_types):
             if kind not in STATE_SIZE:
                 raise ValueError(f"no network has a state for agents of type {kind.value}")
+        return self
+
+    @model_validator(mode="after")
+    def _frame_has_a_network(self) -> "NetworkConfig":
+        if self.frame is Frame.GROUND:
+            if self.far_map:
+                raise ValueError("far_map: networks of the ground frame look at the near patch only")
+            return self
+        if self.agent_types != (AgentType.VEHICLE,):
+            raise ValueError("frame: only vehicles are forecast in the agent's frame")
+        if self.blind is BlindContext.OWN or self.max_control_sigma is not None:
+            raise ValueError(
+                "frame: a network of the agent's frame has neither own blind branch nor max_control_sigma"
+            )
         return self
 
     def looks_at_map(self, agent_type: AgentType) -> bool:

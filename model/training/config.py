@@ -11,11 +11,12 @@ from collections.abc import Mapping
 from enum import StrEnum
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from model.networks.config import AnyNetworkConfig, CoverNetConfig
+from model.training.mixture_objective import MixtureWeights
 from model.training.precision import Precision
 
 
@@ -94,6 +95,15 @@ class TrainingConfig(BaseModel):
     curved_copies: int = Field(default=2, ge=1)
     """How often an epoch shows a pair whose path is curved."""
     seed: int = 0
+    variants: int = Field(default=0, ge=0)
+    """V, noisy reports of each training pair (``model.data.sensing``) that are drawn from beside the recorded
+    states; in the agent's frame only."""
+    hide: bool = False
+    """Take map and neighbours away at random (``model.data.hiding``); in the agent's frame only."""
+    mixture: MixtureWeights = MixtureWeights()
+    """Weights of the objective in the agent's frame."""
+    keep: Literal["best", "last"] = "best"
+    """Which epoch is kept: the best on the validation split, or the last one."""
 
     @model_validator(mode="after")
     def _network_fits_method(self) -> "TrainingConfig":

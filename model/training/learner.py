@@ -8,12 +8,17 @@ import torch
 from torch import Tensor, nn
 
 from model.cvae import CvaeNetworks
+from model.data.hiding import hide_context
 from model.forecaster import Features
 from model.network_forecaster import Networks
+from model.networks.agent_frame import AgentFrameNetwork
 from model.networks.config import NetworkConfig
+from model.networks.covernet import turned
+from model.networks.network import AgentNetwork
 from model.scene import AgentType
-from model.training.config import TrainingConfig
+from model.training.config import Method, TrainingConfig
 from model.training.dropout import scale_dropout
+from model.training.mixture_objective import mixture_objective
 from model.training.objectives import OBJECTIVES, Loss, Weights
 from model.training.precision import set_precision
 from model.training.processes import average_gradients
@@ -121,12 +126,42 @@ class CvaeLearner(DescentLearner):
         assert isinstance(config.network, NetworkConfig)  # noqa: S101 (for the type checker; the method's)
         networks = CvaeNetworks(config.network).to(device)
         super().__init__(config, networks)
-        self.network = networks.of(AgentType.VEHICLE)
+        network = networks.of(AgentType.VEHICLE)
+        assert isinstance(network, AgentNetwork)  # noqa: S101 (likewise)
+        self.network = network
         self._objective = OBJECTIVES[config.method.value]
 
     def step(self, batches: Sequence[Batch], weights: Weights, rate: float) -> dict[str, Tensor]:
         (batch,) = batches
         loss = self._objective(self.network, batch.features, batch.future, weights)
+        self.descend(loss.value, rate)
+        return logged(loss)
+
+
+class AgentFrameLearner(DescentLearner):
+    """A network of the agent's frame under the mixture's objective.
+
+    Args:
+        config: of the run.
+        device: of the networks.
+    """
+
+    def __init__(self, config: TrainingConfig, device: torch.device) -> None:
+        assert isinstance(config.network, NetworkConfig)  # noqa: S101 (for the type checker; the method's)
+        networks = CvaeNetworks(config.network).to(device)
+        super().__init__(config, networks)
+        network = networks.of(AgentType.VEHICLE)
+        assert isinstance(network, AgentFrameNetwork)  # noqa: S101 (likewise)
+        self.network = network
+        self._weights = config.mixture
+        self._contrast = config.method is Method.CAB
+        self._hide = config.hide
+
+    def step(self, batches: Sequence[Batch], weights: Weights, rate: float) -> dict[str, Tensor]:
+        (batch,) = batches
+        features = hide_context(batch.features) if self._hide else batch.features
+        future = turned(batch.future, -features["heading"].to(batch.future.dtype))
+        loss = mixture_objective(self.network, features, future, self._weights, self._contrast)
         self.descend(loss.value, rate)
         return logged(loss)
 

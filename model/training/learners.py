@@ -2,10 +2,11 @@
 
 import torch
 
+from model.networks.config import Frame, NetworkConfig
 from model.training.config import Method, TrainingConfig
 from model.training.covernet import CoverNetLearner
 from model.training.halentnet import HalentLearner
-from model.training.learner import CvaeLearner, Learner
+from model.training.learner import AgentFrameLearner, CvaeLearner, Learner
 from model.training.source import BatchSource
 
 
@@ -21,4 +22,6 @@ def make_learner(config: TrainingConfig, train: BatchSource, device: torch.devic
         return HalentLearner(config, device)
     if config.method is Method.COVERNET:
         return CoverNetLearner(config, train.paths, device)
+    if isinstance(config.network, NetworkConfig) and config.network.frame is Frame.AGENT:
+        return AgentFrameLearner(config, device)
     return CvaeLearner(config, device)

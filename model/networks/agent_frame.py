@@ -1,0 +1,331 @@
+"""The network that sees and forecasts in the agent's own frame: origin at the agent, x along its heading.
+
+It keeps the structure of Trajectron++ (Salzmann et al. 2020, section 4): encoders of history, neighbours and
+map, a categorical latent z, and a decoder that forecasts controls of a unicycle for each category. It differs
+where measurements asked for it; ``docs/experiments.md`` has the figures:
+
+- Everything is in the agent's frame, so a scene turned or shifted is forecast turned or shifted.
+- Two map patches: one near and fine, one as far as 6 s reach.
+- All steps of a mode are decoded at once instead of by an unrolled GRU, first as a proposal, and again once
+  map and neighbours have been read where the proposal leads (propose and refine, as Zhou et al. 2023, QCNet).
+- Positions' standard deviations along and across the path are outputs, not propagated from the controls'.
+- p(z | x) is trained as the weights of the mixture itself, so there is no q(z | x, y).
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from model.raster import FAR, NEAR, PatchGeometry
+from model.agent_features import NEIGHBOR_FEATURES
+from model.forecaster import Context, Features
+from model.networks.config import NetworkConfig
+from model.networks.dynamics import Positions
+from model.networks.recurrent import HistoryLSTM
+from model.scene import STEP_SECONDS, AgentType
+from model.standardization import STATE_SIZE
+
+STEPS = 12
+"""T, steps of 0.5 s that are decoded."""
+_WIDTH = 64
+"""Of every encoding."""
+_HIDDEN = 128
+"""Of a mode."""
+_STEP_WIDTH = 32
+"""Of what is read at one step of a mode."""
+_CONTROL_SCALE = (0.3, 2.0)
+"""rad/s and m/s²: a control of 1 in the decoder's units."""
+_MAX_HEADING_CORRECTION = 0.3
+"""rad; a given heading is noisy, so a path may begin that far beside it."""
+_MAX_SPEED_CORRECTION = 2.0
+"""m/s; so is a velocity."""
+_READ_LATERAL_M = (-6.0, -3.5, -1.75, 0.0, 1.75, 3.5, 6.0)
+_READ_AHEAD_M = (0.0, 5.0)
+"""Where the map is read around each position of a mode, m, in the frame of the path there."""
+_NEAR_M, _WIDE_M = 2.5, 8.0
+"""Widths of the bumps by which a mode feels how near it comes to a neighbour."""
+
+
+class MapEncoder(nn.Module):
+    """Convolutions over a map patch: [N, 3, 100, 100] in [-1, 1], 0 unknown → [N, 64]."""
+
+    def __init__(self, dropout: float) -> None:
+        super().__init__()
+        self.convs = nn.ModuleList(
+            [
+                nn.Conv2d(3, 32, 4, stride=4),
+                nn.Conv2d(32, 48, 3, stride=2, padding=1),
+                nn.Conv2d(48, 48, 3, padding=1),
+                nn.Conv2d(48, 32, 3, stride=2, padding=1),
+            ]
+        )
+        self.project = nn.Linear(32 * 7 * 7, _WIDTH)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, patches: Tensor) -> Tensor:
+        patches = patches.contiguous(memory_format=torch.channels_last)
+        for conv in self.convs:
+            patches = F.relu(conv(patches))
+        encoded: Tensor = self.dropout(F.relu(self.project(patches.flatten(1))))
+        return encoded
+
+
+class NeighborEncoder(nn.Module):
+    """Attention of an agent over its neighbours: [N, M, D] → [N, 64].
+
+    A neighbour is a token of its state in the agent's frame; the query is the own history. A learned token
+    stands for "nobody", so that nothing near says something, too.
+    """
+
+    def __init__(self, heads: int = 4) -> None:
+        super().__init__()
+        self.heads = heads
+        self.token = nn.Sequential(nn.Linear(NEIGHBOR_FEATURES, _WIDTH), nn.ReLU(), nn.Linear(_WIDTH, _WIDTH))
+        self.nobody = nn.Parameter(torch.zeros(_WIDTH))
+        self.query = nn.Linear(_WIDTH, _WIDTH)
+        self.key_value = nn.Linear(_WIDTH, 2 * _WIDTH)
+        self.out = nn.Linear(_WIDTH, _WIDTH)
+
+    def forward(self, neighbors: Tensor, present: Tensor, own: Tensor) -> Tensor:
+        """Return the neighbours' influence: [N, 64].
+
+        Args:
+            neighbors: [N, M, D].
+            present: [N, M] bool, which of them there are.
+            own: [N, 64], the encoded history.
+        """
+        count = len(own)
+        tokens = F.relu(self.token(neighbors))
+        tokens = torch.cat([self.nobody.expand(count, 1, -1), tokens], dim=1)
+        there = torch.cat([present.new_ones(count, 1), present], dim=1)
+        key, value = self.key_value(tokens).chunk(2, dim=-1)
+        query = self.query(own).view(count, self.heads, 1, -1)
+        key = key.unflatten(-1, (self.heads, -1)).transpose(1, 2)
+        value = value.unflatten(-1, (self.heads, -1)).transpose(1, 2)
+        scores = (query * key).sum(-1) / math.sqrt(key.shape[-1])  # [N, heads, 1 + M]
+        weights = scores.masked_fill(~there[:, None], -math.inf).softmax(dim=-1)
+        influence: Tensor = F.relu(self.out((weights[..., None] * value).sum(2).flatten(1)))
+        return influence
+
+
+class Path(NamedTuple):
+    """Means of the modes in the agent's frame: [N, K, T] each."""
+
+    x: Tensor
+    """m, ahead."""
+    y: Tensor
+    """m, to the left."""
+    heading: Tensor
+    """rad, of the path at the step."""
+    speed: Tensor
+    """m/s, signed along the heading."""
+
+
+def drive(controls: Tensor, heading: Tensor, speed: Tensor) -> Path:
+    """Return the paths of a unicycle, by the midpoint rule.
+
+    Args:
+        controls: [N, K, T, 2], heading rate (rad/s) and acceleration (m/s²).
+        heading: [N, K] rad, now.
+        speed: [N, K] m/s, now.
+    """
+    dt = STEP_SECONDS
+    turned, gained = (dt * controls.cumsum(dim=2)).unbind(-1)
+    phi, v = heading[..., None] + turned, speed[..., None] + gained
+    rate, acceleration = controls.unbind(-1)
+    middle, mean_speed = phi - 0.5 * dt * rate, v - 0.5 * dt * acceleration
+    x = dt * (mean_speed * middle.cos()).cumsum(dim=2)
+    y = dt * (mean_speed * middle.sin()).cumsum(dim=2)
+    return Path(x, y, phi, v)
+
+
+class Modes(NamedTuple):
+    """What the network says in the agent's frame."""
+
+    logits: Tensor
+    """[N, K], of p(z | x)."""
+    proposal: Path
+    path: Path
+    sigma: Tensor
+    """[N, K, T, 2], m, along and across the path."""
+
+
+class AgentFrameNetwork(nn.Module):
+    """The network of vehicles in their own frame, with a full and a blind context.
+
+    Blind is the same network on a null context (CAB, Ben-Younes et al. 2022, section 3): an unknown map and
+    no neighbours, which is also what a call without map and neighbours gives it.
+    """
+
+    width: Tensor
+    """[T], factor on the standard deviations, fitted after training."""
+    temperature: Tensor
+    """[], divisor of the logits, fitted after training."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.history_encoder = HistoryLSTM(STATE_SIZE[AgentType.VEHICLE], _WIDTH)
+        self.neighbor_encoder = NeighborEncoder() if config.neighbor_types else None
+        self.map_encoder = MapEncoder(0.1) if config.uses_map else None
+        self.far_map_encoder = MapEncoder(0.1) if config.far_map else None
+        parts = 1 + sum(
+            part is not None for part in (self.neighbor_encoder, self.map_encoder, self.far_map_encoder)
+        )
+        self.context = nn.Linear(parts * _WIDTH, _HIDDEN)
+        self.modes = nn.Parameter(torch.randn(config.modes, _HIDDEN))
+        self.propose_hidden = nn.Linear(_HIDDEN, _HIDDEN)
+        self.propose = nn.Linear(_HIDDEN, 2 * STEPS + 2)
+        read = 4
+        if config.far_map:
+            read += 3 * len(_READ_LATERAL_M) * len(_READ_AHEAD_M)
+        if config.neighbor_types:
+            read += 2
+        self.read = nn.Linear(read, _STEP_WIDTH)
+        self.refine_hidden = nn.Linear(_HIDDEN + STEPS * _STEP_WIDTH, _HIDDEN)
+        self.refine = nn.Linear(_HIDDEN, 2 * STEPS)
+        self.sigma = nn.Linear(_HIDDEN, 2 * STEPS)
+        self.logits = nn.Linear(_HIDDEN, 1)
+        self.mode_logits = nn.Linear(_HIDDEN, config.modes)
+        for head in (self.refine, self.sigma, self.logits, self.mode_logits):
+            nn.init.zeros_(head.bias)
+            with torch.no_grad():
+                head.weight.mul_(0.1)
+        seconds = STEP_SECONDS * torch.arange(1, STEPS + 1)
+        usual = torch.stack([0.15 * seconds**1.5, 0.08 * seconds**1.3], dim=-1)
+        self.register_buffer("usual_log_sigma", usual.log(), persistent=False)
+        floor = config.min_sigma_m[0] + (config.min_sigma_m[1] - config.min_sigma_m[0]) * (seconds - 1) / 5
+        self.register_buffer("variance_floor", floor.square(), persistent=False)
+        self.register_buffer("width", torch.ones(STEPS))
+        self.register_buffer("temperature", torch.ones(()))
+
+    def encode(self, features: Features, context: Context) -> Tensor:
+        """Return the encoding of what the agent may see: [N, 128]."""
+        own = self.history_encoder(features["history"], features["first"])
+        parts = [own]
+        full = context is Context.FULL
+        if self.neighbor_encoder is not None:
+            neighbors, present = _neighbors(features, full)
+            parts.append(self.neighbor_encoder(neighbors, present, own))
+        for encoder, name in ((self.map_encoder, "map"), (self.far_map_encoder, "far_map")):
+            if encoder is not None and full:
+                parts.append(encoder(features[name]))
+            elif encoder is not None:
+                parts.append(encoder(own.new_zeros(1, 3, 100, 100)).expand(len(own), -1))
+        encoding: Tensor = self.context(torch.cat(parts, dim=1))
+        return encoding
+
+    def decode(self, encoding: Tensor, features: Features, context: Context) -> Modes:
+        """Return every mode's path and widths in the agent's frame."""
+        hidden = F.relu(encoding[:, None] + self.modes)
+        hidden = hidden + F.relu(self.propose_hidden(hidden))
+        proposed = self.propose(hidden)
+        start, controls = proposed[..., :2], proposed[..., 2:].unflatten(-1, (STEPS, 2))
+        scale = controls.new_tensor(_CONTROL_SCALE)
+        speed = features["speed"][:, None]
+        heading = _MAX_HEADING_CORRECTION * torch.tanh(start[..., 0])
+        speed = speed + _MAX_SPEED_CORRECTION * torch.tanh(start[..., 1])
+        proposal = drive(controls * scale, heading, speed)
+        read = F.relu(self.read(self._read(proposal, features, context)))
+        refined = F.relu(self.refine_hidden(torch.cat([hidden, read.flatten(2)], dim=-1)))
+        controls = controls + self.refine(refined).unflatten(-1, (STEPS, 2))
+        path = drive(controls * scale, heading, speed)
+        sigma = (self.usual_log_sigma + self.sigma(refined).unflatten(-1, (STEPS, 2)).clamp(-4, 4)).exp()
+        logits = self.logits(refined)[..., 0] + self.mode_logits(encoding.relu())
+        return Modes(logits, proposal, path, sigma)
+
+    def covariance(self, modes: Modes) -> Tensor:
+        """Return the covariances in the agent's frame, no direction of them below the floor:
+        [N, K, T, 2, 2], m²."""
+        along, across = modes.sigma.square().unbind(-1)
+        scale = self.width.square()
+        along, across = scale * along + self.variance_floor, scale * across + self.variance_floor
+        cos, sin = modes.path.heading.cos(), modes.path.heading.sin()
+        xx = cos.square() * along + sin.square() * across
+        yy = sin.square() * along + cos.square() * across
+        xy = cos * sin * (along - across)
+        return torch.stack([xx, xy, xy, yy], dim=-1).unflatten(-1, (2, 2))
+
+    def forward(self, features: Features, context: Context, steps: int) -> tuple[Tensor, Positions]:
+        """Return log-probabilities of the modes [N, K], and their positions relative to now, ground frame.
+
+        Raises:
+            ValueError: there are more steps than are decoded.
+        """
+        if steps > STEPS:
+            raise ValueError(f"this network forecasts {STEPS} steps, not {steps}")
+        modes = self.decode(self.encode(features, context), features, context)
+        mean = torch.stack([modes.path.x, modes.path.y], dim=-1)[:, :, :steps]
+        covariance = self.covariance(modes)[:, :, :steps]
+        cos, sin = features["heading"].cos(), features["heading"].sin()
+        turn = torch.stack([cos, -sin, sin, cos], dim=-1).unflatten(-1, (2, 2))[:, None, None]
+        mean = (turn @ mean[..., None])[..., 0]
+        covariance = turn @ covariance @ turn.transpose(-1, -2)
+        return F.log_softmax(modes.logits / self.temperature, dim=-1), Positions(mean, covariance)
+
+    def _read(self, path: Path, features: Features, context: Context) -> Tensor:
+        """Return what is met at each step of each mode: [N, K, T, R]. No gradient reaches the path."""
+        x, y, heading, speed = (part.detach() for part in path)
+        full = context is Context.FULL
+        read = [torch.stack([x / 30, y / 30, heading, speed / 15], dim=-1)]
+        if self.far_map_encoder is not None:
+            lateral = x.new_tensor(_READ_LATERAL_M).repeat(len(_READ_AHEAD_M))
+            ahead = x.new_tensor(_READ_AHEAD_M).repeat_interleave(len(_READ_LATERAL_M))
+            if full:
+                cos, sin = heading.cos()[..., None], heading.sin()[..., None]
+                px = x[..., None] + cos * ahead - sin * lateral
+                py = y[..., None] + sin * ahead + cos * lateral
+                read.append(read_patch(features["far_map"], px, py, FAR).flatten(3))
+            else:
+                read.append(x.new_zeros(*x.shape, 3 * len(lateral)))
+        if self.neighbor_encoder is not None:
+            read.append(_closeness(x, y, features) if full else x.new_zeros(*x.shape, 2))
+        return torch.cat(read, dim=-1)
+
+
+def read_patch(patches: Tensor, x: Tensor, y: Tensor, geometry: PatchGeometry) -> Tensor:
+    """Return a patch's layers at points in its agent's frame, bilinear, 0 (unknown) outside.
+
+    Args:
+        patches: [N, 3, S, S].
+        x: [N, …] m ahead.
+        y: [N, …] m to the left.
+        geometry: of the patches.
+
+    Returns:
+        [N, …, 3].
+    """
+    size = geometry.size
+    row = (x * geometry.pixels_per_meter + geometry.rows_behind + 0.5) * (2 / size) - 1
+    column = (y * geometry.pixels_per_meter + geometry.columns_right + 0.5) * (2 / size) - 1
+    grid = torch.stack([column, row], dim=-1).flatten(1, -2)[:, None]  # [N, 1, P, 2]
+    values = F.grid_sample(patches, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
+    return values[:, :, 0].transpose(1, 2).unflatten(1, x.shape[1:])
+
+
+def _neighbors(features: Features, full: bool) -> tuple[Tensor, Tensor]:
+    neighbors = features["neighbors"] if full else features["history"].new_zeros(1, 1, NEIGHBOR_FEATURES)
+    if not full:
+        neighbors = neighbors.expand(len(features["history"]), -1, -1)
+    return neighbors, neighbors[..., -1] > 0
+
+
+def _closeness(x: Tensor, y: Tensor, features: Features) -> Tensor:
+    """Return how near each step comes to where a neighbour will be if it goes on as now: [N, K, T, 2]."""
+    neighbors = features["neighbors"]
+    seconds = STEP_SECONDS * torch.arange(1, x.shape[-1] + 1, dtype=x.dtype, device=x.device)
+    place = (
+        30 * neighbors[:, :, None, 0:2] + 15 * neighbors[:, :, None, 4:6] * seconds[:, None]
+    )  # [N, M, T, 2]
+    squared = (x[:, None] - place[..., 0][:, :, None]).square() + (
+        y[:, None] - place[..., 1][:, :, None]
+    ).square()
+    squared = squared.masked_fill(~(neighbors[..., -1] > 0)[:, :, None, None], math.inf)
+    nearest = squared.amin(dim=1)
+    return torch.stack([(-nearest / (2 * w**2)).exp() for w in (_NEAR_M, _WIDE_M)], dim=-1)
+
+
+__all__ = ["FAR", "NEAR", "STEPS", "AgentFrameNetwork", "MapEncoder", "Modes", "Path", "drive", "read_patch"]

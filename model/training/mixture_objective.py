@@ -1,0 +1,138 @@
+"""The objective of networks in the agent's frame: a mixture whose modes differ and whose weights mean something.
+
+It joins what measurements asked for (``docs/experiments.md``): the likelihood of the mixture with the weights
+p(z | x) themselves, a pull of the nearest mode towards the truth (multiple choice learning; Guzman-Rivera et
+al. 2012, as in MTP and MultiPath), the probability of the nearest modes, and the distance from the truth that
+is expected under the probabilities, which asks that the likeliest be near. CAB adds the same terms of its
+blind forecast, and the divergence of full and blind latents (Ben-Younes et al. 2022, section 3.3).
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from pydantic import BaseModel, ConfigDict, Field
+from torch import Tensor
+
+from model.forecaster import Context, Features
+from model.networks.agent_frame import AgentFrameNetwork, Modes, Path, read_patch
+from model.raster import FAR
+from model.training.elbo import divergence
+from model.training.objectives import Loss
+
+
+class MixtureWeights(BaseModel):
+    """Weights of the objective's terms."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    likelihood: float = Field(default=1.0, ge=0)
+    """Of the negative log-likelihood of a step, nats, mean over the steps."""
+    joint_likelihood: float = Field(default=0.0, ge=0)
+    """Of that of the whole trajectory, nats a step."""
+    nearest: float = Field(default=1.0, ge=0)
+    """1/m, of the mean distance of the nearest mode."""
+    choice: float = Field(default=0.0, ge=0)
+    """Of the cross-entropy of p(z | x) with modes chosen by their distances."""
+    choice_range_m: float = Field(default=1.0, gt=0)
+    """m; modes count as chosen by exp(−distance / range)."""
+    expected: float = Field(default=1.0, ge=0)
+    """1/m, of the mean distance expected under p(z | x)."""
+    off_road: float = Field(default=0.0, ge=0)
+    """Of the share of the steps off the road, expected under p(z | x)."""
+    proposal: float = Field(default=0.5, ge=0)
+    """Of the distances of the proposals, beside those of the refined modes."""
+    blind: float = Field(default=1.0, ge=0)
+    """Of all terms of the blind forecast (CAB's λ)."""
+    apart: float = Field(default=0.1, ge=0)
+    """λ_KL of CAB: how much full and blind latents are pressed apart."""
+
+
+class _Terms(NamedTuple):
+    value: Tensor
+    named: dict[str, Tensor]
+    log_weights: Tensor
+    """[N, K]."""
+
+
+def mixture_objective(
+    network: AgentFrameNetwork, features: Features, future: Tensor, weights: MixtureWeights, contrast: bool
+) -> Loss:
+    """Return the loss.
+
+    Args:
+        network: in training mode.
+        features: of N agents, full context.
+        future: [N, T, 2], m, in the agents' frames, relative to now.
+        weights: of the terms.
+        contrast: whether the blind forecast is trained, too, and pressed apart (CAB).
+    """
+    full = _terms(network, features, future, weights, Context.FULL)
+    if not contrast:
+        return Loss(full.value, full.named)
+    blind = _terms(network, features, future, weights, Context.BLIND)
+    apart = divergence(full.log_weights, blind.log_weights.detach())
+    value = full.value + weights.blind * blind.value - weights.apart * apart
+    named = {
+        f"{name}_{which}": term
+        for which, one in (("full", full), ("blind", blind))
+        for name, term in one.named.items()
+    }
+    return Loss(value, named | {"kl_full_blind": apart.detach()})
+
+
+def _terms(
+    network: AgentFrameNetwork, features: Features, future: Tensor, weights: MixtureWeights, context: Context
+) -> _Terms:
+    modes = network.decode(network.encode(features, context), features, context)
+    log_weights = F.log_softmax(modes.logits, dim=-1)
+    density = step_log_density(network, modes, future)
+    nll = -torch.logsumexp(log_weights[..., None] + density, dim=1).mean()
+    distance, proposed = _distances(modes.path, future), _distances(modes.proposal, future)
+    mean_distance = distance.mean(dim=-1)
+    # The end counts twice: modes that differ at the end only are still different ones
+    score = (mean_distance + 0.5 * distance[..., -1]).detach()
+    nearest = score.argmin(dim=1, keepdim=True)
+    pulled = mean_distance.gather(1, nearest).mean()
+    expected = (log_weights.exp() * mean_distance).sum(dim=1).mean()
+    value = weights.likelihood * nll + weights.nearest * pulled + weights.expected * expected
+    of_proposal = proposed.mean(dim=-1)
+    value = value + weights.proposal * (
+        weights.nearest * of_proposal.gather(1, nearest).mean()
+        + weights.expected * (log_weights.exp().detach() * of_proposal).sum(dim=1).mean()
+    )
+    named = {"nll": nll, "nearest_m": pulled, "expected_m": expected}
+    if weights.joint_likelihood:
+        steps = future.shape[1]
+        joint = -torch.logsumexp(log_weights + density.sum(dim=-1), dim=1).mean() / steps
+        value = value + weights.joint_likelihood * joint
+        named["joint_nll"] = joint
+    if weights.choice:
+        chosen = F.softmax(-score / weights.choice_range_m, dim=1)
+        choice = -(chosen * log_weights).sum(dim=1).mean()
+        value = value + weights.choice * choice
+        named["choice"] = choice
+    if weights.off_road and context is Context.FULL and "far_map" in features:
+        road = read_patch(features["far_map"], modes.path.x, modes.path.y, FAR)[..., 0]
+        off = (log_weights.exp() * F.relu(-road).mean(dim=-1)).sum(dim=1).mean()
+        value = value + weights.off_road * off
+        named["off_road"] = off
+    return _Terms(value, {name: term.detach() for name, term in named.items()}, log_weights)
+
+
+def step_log_density(network: AgentFrameNetwork, modes: Modes, future: Tensor) -> Tensor:
+    """Return the log-density of the true position under each mode at each step: [N, K, T], 1/m² inside the
+    log, with the network's floor of the variances."""
+    ahead, left = (future[:, None, :, axis] - part for axis, part in enumerate((modes.path.x, modes.path.y)))
+    cos, sin = modes.path.heading.cos(), modes.path.heading.sin()
+    along, across = cos * ahead + sin * left, cos * left - sin * ahead
+    variance = modes.sigma.square() + network.variance_floor[:, None]
+    squared = along.square() / variance[..., 0] + across.square() / variance[..., 1]
+    return -0.5 * (squared + variance.log().sum(dim=-1)) - math.log(2 * math.pi)
+
+
+def _distances(path: Path, future: Tensor) -> Tensor:
+    """Return the distance of each mode from the truth at each step: [N, K, T], m."""
+    squared = (future[:, None, :, 0] - path.x).square() + (future[:, None, :, 1] - path.y).square()
+    return (squared + 1e-6).sqrt()  # the root has no gradient at zero
