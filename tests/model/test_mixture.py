@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.distributions import Categorical, MixtureSameFamily, MultivariateNormal
 
-from model.mixture import TrajectoryMixture, cholesky_2x2
+from model.mixture import MergedModes, TrajectoryMixture, cholesky_2x2, merge_modes
 
 
 def mixture(
@@ -176,3 +176,225 @@ def test_a_degenerate_mode_has_a_finite_density_that_falls_off() -> None:
         assert math.isfinite(near)
         assert math.isfinite(off)
         assert off < near - 10
+
+
+def _fan(seed: int, agents: int = 3, modes: int = 8, steps: int = 6) -> TrajectoryMixture:
+    """One of a few bundles of paths that leave the origin, so that some of its modes merge."""
+    generator = torch.Generator().manual_seed(seed)
+    bundles = 12 * torch.randn(agents, 3, 2, generator=generator, dtype=torch.float64)
+    chosen = torch.randint(3, (agents, modes), generator=generator)
+    time = torch.linspace(1 / steps, 1, steps, dtype=torch.float64)
+    base = mixture(seed, agents, modes, steps)
+    means = bundles.gather(1, chosen[..., None].expand(-1, -1, 2))[:, :, None] * time[:, None]
+    return TrajectoryMixture(base.log_weights, means + 0.2 * base.means, base.covariances, base.origin)
+
+
+def _near(kept: Tensor, other: Tensor, min_distance_m: float = 2.0, relative_distance: float = 0.2) -> bool:
+    """Whether a path [T, 2] is within the allowance of a kept one at every step."""
+    allowed = (relative_distance * torch.linalg.vector_norm(kept, dim=-1)).clamp_min(min_distance_m)
+    return bool((torch.linalg.vector_norm(kept - other, dim=-1) <= allowed).all())
+
+
+def _leaders(weights: list[float], means: Tensor) -> dict[int, int]:
+    """Which mode each of one agent's modes joins, by the rule as it is told."""
+    leaders: dict[int, int] = {}
+    for mode in sorted(range(len(weights)), key=lambda mode: -weights[mode]):
+        kept = [leader for leader in leaders if leaders[leader] == leader]
+        leaders[mode] = next((leader for leader in kept if _near(means[leader], means[mode])), mode)
+    return leaders
+
+
+def _members(merged: MergedModes, agent: int) -> dict[int, list[int]]:
+    """The modes of each group of an agent, by the number of the group's heaviest."""
+    ids, groups = merged.mode_ids[agent].tolist(), merged.groups[agent]
+    return {ids[place]: (groups == place).nonzero()[:, 0].tolist() for place in range(merged.counts[agent])}
+
+
+@settings(max_examples=60, deadline=None)
+@given(seeds)
+def test_modes_join_the_heaviest_that_is_kept_and_near(seed: int) -> None:
+    m = _fan(seed)
+    merged = merge_modes(m)
+    for agent in range(len(m)):
+        leaders = _leaders(m.weights[agent].tolist(), m.means[agent])
+        groups = _members(merged, agent)
+        assert {mode: leader for leader, modes in groups.items() for mode in modes} == leaders
+        assert list(groups) == sorted(set(leaders.values()))  # In the order of the model's own numbers
+        for one in groups:
+            heavier = [other for other in groups if m.weights[agent, other] > m.weights[agent, one]]
+            assert not any(_near(m.means[agent, other], m.means[agent, one]) for other in heavier)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seeds)
+def test_weights_add_up_and_second_moments_about_the_paths_are_kept(seed: int) -> None:
+    m = _fan(seed)
+    merged = merge_modes(m)
+    torch.testing.assert_close(merged.mixture.weights.sum(1), torch.ones(3, dtype=torch.float64))
+    for agent in range(len(m)):
+        for place, (leader, modes) in enumerate(_members(merged, agent).items()):
+            weights, path = m.weights[agent, modes], m.means[agent, leader]
+            torch.testing.assert_close(merged.mixture.weights[agent, place], weights.sum())
+            assert torch.equal(merged.mixture.means[agent, place], path)
+            offset = m.means[agent, modes] - path
+            moments = m.covariances[agent, modes] + offset[..., :, None] * offset[..., None, :]
+            expected = torch.einsum("m,mtij->tij", weights / weights.sum(), moments)
+            torch.testing.assert_close(merged.mixture.covariances[agent, place], expected)
+            # About the group's own mean it is the members' covariance and the outer product of what the
+            # kept path is off that mean
+            group = TrajectoryMixture(
+                weights.log()[None] - weights.sum().log(),
+                m.means[agent, modes][None],
+                m.covariances[agent, modes][None],
+                torch.zeros(1, 2, dtype=torch.float64),
+            )
+            mean, covariance = (moment[0] for moment in group.moments())
+            bias = mean - path
+            torch.testing.assert_close(expected, covariance + bias[..., :, None] * bias[..., None, :])
+
+
+@settings(max_examples=30, deadline=None)
+@given(seeds, st.permutations(range(8)))
+def test_the_order_of_modes_changes_nothing_but_their_order(seed: int, order: list[int]) -> None:
+    m = _fan(seed)
+    merged = merge_modes(m)
+    turned = merge_modes(
+        TrajectoryMixture(m.log_weights[:, order], m.means[:, order], m.covariances[:, order], m.origin)
+    )
+    for agent in range(len(m)):
+        groups = {
+            order[leader]: sorted(order[mode] for mode in modes)
+            for leader, modes in _members(turned, agent).items()
+        }
+        assert groups == _members(merged, agent)
+
+
+@settings(max_examples=30, deadline=None)
+@given(seeds)
+def test_merging_again_by_a_distance_alone_changes_nothing(seed: int) -> None:
+    once = merge_modes(_fan(seed), relative_distance=0.0)
+    again = merge_modes(once.mixture, relative_distance=0.0)
+    most = int(once.counts.max())
+    assert torch.equal(again.counts, once.counts)
+    assert torch.equal(again.groups, torch.where(once.mode_ids < 0, -1, torch.arange(most)))
+    assert torch.equal(again.mixture.log_weights, once.mixture.log_weights)
+    assert torch.equal(again.mixture.means, once.mixture.means)
+    assert torch.equal(again.mixture.covariances, once.mixture.covariances)
+
+
+def test_merging_again_can_merge_more() -> None:
+    """Two light modes together outweigh a third, and go far enough for it to be near them."""
+    ends = torch.tensor([20.0, 24.2, 24.3], dtype=torch.float64)
+    means = torch.stack([ends, torch.zeros(3, dtype=torch.float64)], dim=-1)[None, :, None]
+    weights = torch.tensor([[0.4, 0.3, 0.3]], dtype=torch.float64)
+    eye = torch.eye(2, dtype=torch.float64).expand(1, 3, 1, 2, 2)
+    once = merge_modes(TrajectoryMixture(weights.log(), means, eye, torch.zeros(1, 2, dtype=torch.float64)))
+    assert once.groups.tolist() == [[0, 1, 1]]
+    assert merge_modes(once.mixture).mode_ids.tolist() == [[1]]
+
+
+@settings(max_examples=30, deadline=None)
+@given(seeds)
+def test_the_likeliest_merged_mode_is_the_group_of_greatest_weight(seed: int) -> None:
+    m = _fan(seed)
+    merged = merge_modes(m)
+    best = merged.mixture.most_likely()
+    for agent in range(len(m)):
+        sums = {
+            leader: float(m.weights[agent, modes].sum()) for leader, modes in _members(merged, agent).items()
+        }
+        assert merged.mode_ids[agent, best[agent]] == max(sums, key=sums.__getitem__)
+
+
+def test_a_way_around_is_not_merged_though_it_ends_at_the_same_place() -> None:
+    steps = torch.arange(1.0, 13.0)
+    straight = torch.stack([2 * steps, torch.zeros(12)], dim=-1)
+    around = straight + torch.stack([torch.zeros(12), 7 * torch.sin(math.pi * steps / 12)], dim=-1)
+    near = straight + torch.tensor([0.0, 1.9])
+    mixture = TrajectoryMixture(
+        torch.tensor([[0.5, 0.3, 0.2]]).log(),
+        torch.stack([straight, around, near])[None],
+        torch.eye(2).expand(1, 3, 12, 2, 2),
+        torch.zeros(1, 2, dtype=torch.float64),
+    )
+    merged = merge_modes(mixture)
+    assert merged.groups.tolist() == [[0, 1, 0]]
+    torch.testing.assert_close(merged.mixture.weights, torch.tensor([[0.7, 0.3]]))
+    assert merge_modes(mixture, relative_distance=1.0).groups.tolist() == [[0, 0, 0]]
+    assert merge_modes(mixture, 1.8, 0.0).groups.tolist() == [[0, 1, 2]]
+
+
+def test_of_equal_weights_the_lower_number_is_kept() -> None:
+    means = torch.tensor([9.0, 0.0, 1.0, 2.0])[None, :, None, None].expand(1, 4, 3, 2)
+    eye = torch.eye(2).expand(1, 4, 3, 2, 2)
+    merged = merge_modes(
+        TrajectoryMixture(torch.full((1, 4), 0.25).log(), means, eye, torch.zeros(1, 2, dtype=torch.float64)),
+        relative_distance=0.0,
+    )
+    # (2, 2) is 2.8 m from (0, 0), the kept mode 1, and 1.4 m from (1, 1), which is not kept
+    assert merged.mode_ids.tolist() == [[0, 1, 3]]
+    assert merged.groups.tolist() == [[0, 1, 1, 2]]
+
+
+def test_modes_that_nothing_joins_keep_every_bit() -> None:
+    m = mixture(2, modes=6, dtype=torch.float32)
+    apart = TrajectoryMixture(
+        m.log_weights, m.means + 1e3 * torch.arange(6)[:, None, None], m.covariances, m.origin + 1e6
+    )
+    for given_, relative in ((apart, 0.0), (mixture(3, modes=1, dtype=torch.float32), 0.2)):
+        merged = merge_modes(given_, relative_distance=relative)
+        for name in ("log_weights", "means", "covariances", "origin"):
+            assert torch.equal(getattr(merged.mixture, name), getattr(given_, name))
+        modes = given_.log_weights.shape[1]
+        assert merged.mode_ids.tolist() == merged.groups.tolist() == 3 * [list(range(modes))]
+        assert merged.counts.tolist() == 3 * [modes]
+
+
+@settings(max_examples=30, deadline=None)
+@given(seeds, st.floats(-1e6, 1e6))
+def test_merging_hangs_neither_on_where_the_ground_frame_is_nor_on_the_rest_of_the_batch(
+    seed: int, x: float
+) -> None:
+    m = _fan(seed)
+    merged = merge_modes(m)
+    moved = merge_modes(_moved(m, torch.tensor([x, -x], dtype=torch.float64)))
+    assert torch.equal(moved.groups, merged.groups)
+    assert torch.equal(moved.mixture.means, merged.mixture.means)
+    for agent in range(len(m)):
+        alone = merge_modes(m[agent : agent + 1])
+        count = int(alone.counts)
+        assert torch.equal(alone.groups[0], merged.groups[agent])
+        assert torch.equal(alone.mixture.log_weights[0], merged.mixture.log_weights[agent, :count])
+        assert torch.equal(alone.mixture.covariances[0], merged.mixture.covariances[agent, :count])
+
+
+@settings(max_examples=20, deadline=None)
+@given(seeds)
+def test_padded_modes_change_no_figure_of_a_mixture(seed: int) -> None:
+    m = _fan(seed)
+    merged = merge_modes(m)
+    positions = m.origin[:, None] + _points(seed, 3, 6)
+    for agent in range(len(m)):
+        count = int(merged.counts[agent])
+        padded, own = merged.mixture[agent : agent + 1], merged.mixture[agent : agent + 1]
+        own = TrajectoryMixture(
+            own.log_weights[:, :count], own.means[:, :count], own.covariances[:, :count], own.origin
+        )
+        assert padded.weights[0, count:].sum() == 0
+        assert (merged.mode_ids[agent, count:] == -1).all()
+        at = positions[agent : agent + 1]
+        torch.testing.assert_close(padded.log_density(at), own.log_density(at), rtol=0, atol=1e-12)
+        torch.testing.assert_close(padded.moments(), own.moments(), rtol=0, atol=1e-12)
+        assert torch.equal(padded.sample(20, [seed]), own.sample(20, [seed]))
+        assert padded.most_likely() == own.most_likely()
+
+
+def test_a_negative_distance_is_refused() -> None:
+    for distances in ((-1.0, 0.2), (2.0, -0.1)):
+        with pytest.raises(ValueError, match="must not be negative"):
+            merge_modes(mixture(), *distances)
+
+
+def test_of_no_agents_nothing_is_merged() -> None:
+    merged = merge_modes(mixture()[:0])
+    assert len(merged.mixture) == len(merged.counts) == 0
