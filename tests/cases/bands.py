@@ -93,6 +93,8 @@ def _standing(
     if case.facts.oriented:
         ahead = checks.share_of_moving_ahead(forecast, 2.0, 3.0, math.radians(60))
         yield Reading("of that within 60°", ahead, low=0.95)
+        modes = checks.weight_of_moving_ahead(forecast, 2.0, 3.0, math.radians(60))
+        yield Reading("of moving modes within 60°", modes)
 
 
 def _sideways(

@@ -95,6 +95,16 @@ def share_of_moving_ahead(forecast: LocalForecast, metres: float, seconds: float
     return float((np.abs(np.arctan2(moving[:, 1], moving[:, 0])) <= within).mean())
 
 
+def weight_of_moving_ahead(forecast: LocalForecast, metres: float, seconds: float, within: float) -> float:
+    """Return the same of the modes by their means, weighted."""
+    end = forecast.means[:, step(seconds)]
+    moving = np.linalg.norm(end, axis=-1) > metres
+    if not moving.any():
+        return float("nan")
+    ahead = moving & (np.abs(np.arctan2(end[:, 1], end[:, 0])) <= within)
+    return float(forecast.weights[ahead].sum() / forecast.weights[moving].sum())
+
+
 def share_sideways(forecast: LocalForecast, metres: float) -> float:
     """Return the share of the samples that end more than so many metres beside the car's axis."""
     return float((np.abs(forecast.samples[:, -1, 1]) > metres).mean())

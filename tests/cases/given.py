@@ -14,7 +14,7 @@ from tests.cases.case import CAR, Case, Facts, Frame, Row
 _CLEAN = "straight_10_clean"
 _OUTER = (0.0, -5.25)
 _WAITING = (-13.0, -1.75)
-_KNOWN: dict[str, tuple[Row, tuple[float, float], Facts]] = {
+KNOWN: dict[str, tuple[Row, tuple[float, float], Facts]] = {
     "standing_v0": (Row.STANDING, _WAITING, Facts(0.0)),
     "stopped_redlight": (Row.STANDING, _WAITING, Facts(0.0)),
     "standing_sideways_2cms": (Row.SIDEWAYS, _WAITING, Facts(0.0)),
@@ -56,14 +56,14 @@ def read_cases(folder: Path) -> list[Case]:
         FileNotFoundError: one of them is not there.
         ValueError: there is one that nothing is known of.
     """
-    unknown = {file.stem for file in folder.glob("*.json")} - set(_KNOWN)
+    unknown = {file.stem for file in folder.glob("*.json")} - set(KNOWN)
     if unknown:
         raise ValueError(f"{folder}: no row is known for {', '.join(sorted(unknown))}")
-    return [_read(folder / f"{name}.json") for name in _KNOWN]
+    return [_read(folder / f"{name}.json") for name in KNOWN]
 
 
 def _read(file: Path) -> Case:
-    row, position, facts = _KNOWN[file.stem]
+    row, position, facts = KNOWN[file.stem]
     request = json_format.Parse(file.read_text(), pb.PredictRequest())
     frame = Frame(np.array(position), facts.turned)
     leads = [agent.states[-1] for agent in request.agents if agent.id != CAR]

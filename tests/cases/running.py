@@ -8,8 +8,8 @@ from typing import Self
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from cab_forecast import forecasts
 from model.checkpoint import load_checkpoint
-from model.forecaster import Forecaster
-from model.registry import Registry
+from model.forecaster import Forecaster, ModelInfo
+from model.registry import Registry, load_checkpoints
 from service.core.dataplane import DataPlane
 from service.settings import bundled_models
 from service.telemetry.metrics import Metrics
@@ -27,29 +27,47 @@ def bundled(name: str) -> Forecaster:
     return Registry.load(bundled_models(), allow_paper=True).get(name)
 
 
+def network_frame(info: ModelInfo) -> str:
+    """Return in which frame a bundled model's network sees the world: "agent" or "ground".
+
+    Raises:
+        ValueError: it has no checkpoint.
+    """
+    folder = bundled_models()
+    for checkpoint in () if folder is None else load_checkpoints(folder):
+        if checkpoint.info == info:
+            return str(getattr(checkpoint.network, "frame", "ground"))
+    raise ValueError(f"{info.full_name} has no bundled checkpoint")
+
+
 def from_checkpoint(folder: Path) -> Forecaster:
     """Return the model in a checkpoint's folder."""
     return load_checkpoint(folder).forecaster()
 
 
 class Served:
-    """A context manager with a model behind the service's core; the baselines stand by for what it refuses."""
+    """A context manager: a model behind the service's core, and the baselines for what it cannot forecast."""
 
     def __init__(self, forecaster: Forecaster) -> None:
         self.info = forecaster.info
         """What is known of the model."""
-        self.forecaster = forecaster
+        self._forecaster = forecaster
         self._runner = asyncio.Runner()
         own = settings(default_model=forecaster.info.name, max_batch_agents=_AT_ONCE)
         self._plane = DataPlane(own, Metrics())
 
     def __enter__(self) -> Self:
-        self._runner.run(self._plane.open(lambda: registry(self.forecaster)))
+        self._runner.run(self._plane.open(self._load))
         return self
 
     def __exit__(self, *_: object) -> None:
         self._runner.run(self._plane.close())
         self._runner.close()
+
+    def _load(self) -> Registry:
+        """Return the baselines and the model, which may be one of them."""
+        alone = registry()
+        return alone if self.info in alone.infos() else registry(self._forecaster)
 
     def answer(self, cases: Sequence[Case]) -> list[LocalForecast]:
         """Return the forecast of each case's car, made as the server makes it: from request to answer.
