@@ -1,0 +1,116 @@
+"""The bundled default model on made-up scenes: what a planner may expect of it, row by row."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import get_args
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tests.cases import checks, driving, scenes
+from tests.cases import given as shared_cases
+from tests.cases.bands import Reading, few_modes, readings, widths
+from tests.cases.case import Case, Pose, Scenario, View
+from tests.cases.checks import LocalForecast
+from tests.cases.report import TURNED_WITHIN
+from tests.cases.running import Served, bundled, network_frame
+
+pytestmark = pytest.mark.cases
+
+MODEL = "cab"
+SCENARIOS = {one.name: one for one in scenes.at_poses(scenes.all_rows())}
+DRIVES = {one.name: one for one in driving.drives()}
+
+Answers = dict[str, tuple[Case, LocalForecast]]
+"""By the case's name."""
+
+
+@pytest.fixture(scope="module")
+def served() -> Iterator[Served]:
+    """The model."""
+    with Served(bundled(MODEL)) as model:
+        yield model
+
+
+@pytest.fixture(scope="module")
+def own(served: Served) -> Answers:
+    """Forecasts of the scenes with numbers of our own."""
+    return _answers(served, [scenario.case() for scenario in SCENARIOS.values()])
+
+
+@pytest.fixture(scope="module")
+def known(served: Served, shared: Path) -> Answers:
+    """Forecasts of the cases beside the checkout."""
+    folder = shared / "cases"
+    if not folder.is_dir():
+        pytest.skip(f"the shared cases are not here: {folder}")
+    return _answers(served, shared_cases.read_cases(folder))
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_the_row_holds(own: Answers, served: Served, name: str) -> None:
+    _within(_row(own, name, served.info.name))
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_no_mode_that_moves_is_too_narrow(own: Answers, name: str) -> None:
+    _within(widths(own[name][1]))
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_few_modes_hold_the_weight(own: Answers, name: str) -> None:
+    _within(few_modes(own[name][1]))
+
+
+@pytest.mark.parametrize("name", shared_cases.KNOWN)
+def test_the_row_of_a_shared_case_holds(known: Answers, served: Served, name: str) -> None:
+    _within(_row(known, name, served.info.name))
+
+
+@pytest.mark.parametrize("name", shared_cases.KNOWN)
+def test_a_shared_case_has_few_modes_and_none_too_narrow(known: Answers, name: str) -> None:
+    _within([*widths(known[name][1]), *few_modes(known[name][1])])
+
+
+@pytest.mark.parametrize("name", DRIVES)
+def test_the_likeliest_end_does_not_jump_from_tick_to_tick(served: Served, name: str) -> None:
+    drive = DRIVES[name]
+    _within(drive.readings(served.answer([one.case() for one in drive.ticks])))
+
+
+@pytest.mark.parametrize("view", get_args(View))
+def test_a_turned_and_shifted_scene_has_the_turned_forecasts(served: Served, view: View) -> None:
+    frame = network_frame(served.info)
+    if frame != "agent":
+        pytest.skip(f"{served.info.full_name} sees the {frame} frame, not the agent's")
+
+    @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+    @given(
+        scenario=st.sampled_from(list(SCENARIOS.values())),
+        angle=st.floats(-math.pi, math.pi),
+        x=st.floats(-1e4, 1e4),
+        y=st.floats(-1e4, 1e4),
+    )
+    def holds(scenario: Scenario, angle: float, x: float, y: float) -> None:
+        here, there = Pose(), Pose(x, y, angle)
+        one, other = served.answer([scenario.at(pose).case(view) for pose in (here, there)])
+        assert checks.apart(one, other) <= TURNED_WITHIN[view]
+
+    holds()
+
+
+def _answers(served: Served, cases: list[Case]) -> Answers:
+    return {case.name: (case, forecast) for case, forecast in zip(cases, served.answer(cases), strict=True)}
+
+
+def _row(answers: Answers, name: str, model: str) -> list[Reading]:
+    case, forecast = answers[name]
+    companion = answers[case.facts.companion][1] if case.facts.companion else None
+    return readings(case, forecast, companion, model)
+
+
+def _within(found: list[Reading]) -> None:
+    wrong = [str(one) for one in found if not one.ok]
+    assert not wrong, "; ".join(wrong)
