@@ -21,12 +21,20 @@ from model.scene import AgentType
 class Batches:
     """Features and truths of any pairs, without a loop over them."""
 
-    def __init__(self, cache: Cache, device: torch.device, config: AnyNetworkConfig | None = None) -> None:
+    def __init__(
+        self,
+        cache: Cache,
+        device: torch.device,
+        config: AnyNetworkConfig | None = None,
+        packed_maps: bool = False,
+    ) -> None:
         """
         Args:
             cache: the pairs.
             device: where batches are made and stay; on a GPU all of the cache is copied there.
             config: what the network looks at, for a network that sees less than is there; None: all.
+            packed_maps: leave map patches of the agent's frame packed, three layers a byte: augmentation
+                then moves a twelfth of the memory, and ``packing.unpack_patches`` is the caller's.
 
         Raises:
             DataError: the cache was made for other neighbours than the network's.
@@ -43,6 +51,7 @@ class Batches:
             held = "the agents' own frames" if key.agent_frame else "the ground frame"
             raise DataError(f"the cache holds features in {held}, which this network does not take")
         self.variants = key.variants
+        self._keeps_packed = packed_maps
         arrays = {
             "origin": cache.position,
             "velocity": cache.velocity,
@@ -115,7 +124,7 @@ class Batches:
         for name, packed in self._packed.items():
             # On a CPU the file is read as it is needed
             here = packed[indices.cpu()].to(self._device)
-            features[name] = unpack_patches(here)
+            features[name] = here if self._keeps_packed else unpack_patches(here)
         return features, self._future.index_select(0, indices)
 
 

@@ -28,7 +28,6 @@ from model.data.cache_layout import (
     CacheKey,
     Layout,
     Manifest,
-    derivation,
     neighbors_name,
     pair_layout,
 )
@@ -196,7 +195,6 @@ def build_cache(
         _save(new, scenes, SCENE_LAYOUT)
         manifest = Manifest(
             format_version=FORMAT_VERSION,
-            derivation=derivation(key),
             key=key,
             pairs=sum(len(part["frame"]) for part in pairs),
             scenes=tuple(names),
@@ -348,8 +346,6 @@ def _read_manifest(file: Path) -> Manifest:
     except ValidationError as error:
         faults = (f"{'.'.join(map(str, fault['loc']))}: {fault['msg']}" for fault in error.errors())
         raise DataError(f"{file}: {'; '.join(faults)}") from error
-    if manifest.derivation != derivation(manifest.key):
-        raise DataError(f"{file}: made by other code than this (derivation differs); build the cache anew")
     return manifest
 
 

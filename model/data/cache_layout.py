@@ -1,25 +1,11 @@
 """What a cache of pairs consists of, and how one tells whether it is the right one."""
 
-import hashlib
-import inspect
 from typing import TypeAlias
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from model import (
-    agent_features,
-    features,
-    geometry,
-    inputs,
-    neighbors,
-    raster,
-    resample,
-    standardization,
-    surroundings,
-)
 from model.agent_features import NEIGHBOR_FEATURES, NEIGHBORS
-from model.data import packing, protocols, sensing
 from model.data.checks import FUTURE_STEPS
 from model.data.scenes import Reader
 from model.forecaster import Protocol
@@ -29,14 +15,11 @@ from model.scene import AgentType
 from model.standardization import STATE_SIZE
 from model.surroundings import BOX_NUMBERS, BOXES
 
-FORMAT_VERSION = 1
-"""Of the folder's layout; what reads one version reads no other."""
+FORMAT_VERSION = 2
+"""Version of the folder's layout and of how its arrays are derived from the data: whoever changes either
+(resampling, features, sensing) raises it, and caches of other versions are built anew."""
 MANIFEST_FILE = "manifest.json"
 RASTERS_FILE = "rasters.u8"
-
-_DERIVED_BY = (resample, features, neighbors, standardization, geometry, protocols, packing)
-_DRAWN_BY = (inputs, surroundings, raster)
-_IN_AGENT_FRAME_BY = (agent_features, raster, sensing)
 
 Layout: TypeAlias = dict[str, tuple[type[np.generic], tuple[int, ...]]]
 """Type and shape, without the first axis, of arrays by name."""
@@ -116,8 +99,6 @@ class Manifest(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     format_version: int
-    derivation: str
-    """Digest of the code that the arrays come out of."""
     key: CacheKey
     pairs: int = Field(ge=1)
     """Rows: each pair has one, and after it one for each of its variants."""
@@ -170,12 +151,3 @@ def draws(config: AnyNetworkConfig) -> bool:
 def neighbors_name(kind: AgentType) -> str:
     """Name of the summed histories of neighbours of a type, in caches as in features."""
     return f"neighbors.{kind.value}"
-
-
-def derivation(key: CacheKey) -> str:
-    """Digest of the code that arrays come out of: a cache that other code has made is stale."""
-    digest = hashlib.sha256()
-    others = (*(_DRAWN_BY if key.drawn else ()), *(_IN_AGENT_FRAME_BY if key.agent_frame else ()))
-    for module in (*_DERIVED_BY, *others):
-        digest.update(inspect.getsource(module).encode())
-    return digest.hexdigest()

@@ -4,6 +4,7 @@ from typing import Final
 
 import torch
 
+from model.data.packing import UNKNOWN
 from model.forecaster import Features
 
 NO_MAP: Final = 0.04
@@ -22,7 +23,8 @@ def hide_context(features: Features) -> Features:
     """Return features in which some agents lack a map, a part of it, or their neighbours.
 
     Args:
-        features: in the agents' frames (``model.agent_features``); left as they are.
+        features: in the agents' frames (``model.agent_features``), maps packed (``Batches``); left as they
+            are.
     """
     hidden = dict(features)
     count = len(features["history"])
@@ -33,10 +35,10 @@ def hide_context(features: Features) -> Features:
             continue
         gone = none | (torch.rand(count, device=device) < share)
         patches = features[name].clone()
-        patches[gone] = 0.0
-        size = patches.shape[2]
+        patches[gone] = UNKNOWN
+        size = patches.shape[1]
         for row in (short & ~gone).nonzero()[:, 0].tolist():
-            patches[row, :, int(torch.randint(size // 4, size, ())) :] = 0.0
+            patches[row, int(torch.randint(size // 4, size, ())) :] = UNKNOWN
         hidden[name] = patches
     if "neighbors" in features:
         alone = torch.rand(count, device=device) < NO_NEIGHBORS

@@ -32,8 +32,8 @@ def unpack(packed: Bytes, rows: int, columns: int) -> Bytes:
 
 _LEVELS = 4
 """Of a layer in a packed patch: 0, ⅓, ⅔, 1. Bilinear samples lie between 0 and 1 at edges only."""
-_UNKNOWN = 1 << 6
-"""Set where nothing is known."""
+UNKNOWN = 1 << 6
+"""The byte of a pixel of which nothing is known."""
 
 
 def pack_patches(patches: Float32s) -> Bytes:
@@ -44,7 +44,7 @@ def pack_patches(patches: Float32s) -> Bytes:
     """
     level = np.round(patches * (_LEVELS - 1)).astype(np.uint8)
     packed = level[:, 0] | level[:, 1] << 2 | level[:, 2] << 4
-    packed[(np.abs(patches - 0.5) < 1e-3).all(axis=1)] = _UNKNOWN
+    packed[(np.abs(patches - 0.5) < 1e-3).all(axis=1)] = UNKNOWN
     result: Bytes = packed
     return result
 
@@ -54,7 +54,7 @@ def _table() -> Tensor:
     byte = torch.arange(256)
     layers = torch.stack([byte >> 2 * layer & 3 for layer in range(LAYERS)], dim=-1)
     table = 2 * layers.float() / (_LEVELS - 1) - 1
-    table[byte >= _UNKNOWN] = 0.0
+    table[byte >= UNKNOWN] = 0.0
     return table
 
 

@@ -44,6 +44,8 @@ _MAX_SPEED_CORRECTION = 2.0
 """m/s; so is a velocity."""
 _READ_LATERAL_M = (-6.0, -3.5, -1.75, 0.0, 1.75, 3.5, 6.0)
 _READ_AHEAD_M = (0.0, 5.0)
+_READ_EVERY = 2
+"""Steps between those at which it is read."""
 """Where the map is read around each position of a mode, m, in the frame of the path there."""
 _NEAR_M, _WIDE_M = 2.5, 8.0
 """Widths of the bumps by which a mode feels how near it comes to a neighbour."""
@@ -56,19 +58,19 @@ class MapEncoder(nn.Module):
         super().__init__()
         self.convs = nn.ModuleList(
             [
-                nn.Conv2d(3, 32, 4, stride=4),
+                nn.Conv2d(3, 32, 5, stride=5),
                 nn.Conv2d(32, 48, 3, stride=2, padding=1),
                 nn.Conv2d(48, 48, 3, padding=1),
-                nn.Conv2d(48, 32, 3, stride=2, padding=1),
+                nn.Conv2d(48, 48, 3, stride=2, padding=1),
             ]
         )
-        self.project = nn.Linear(32 * 7 * 7, _WIDTH)
+        self.project = nn.Linear(48 * 5 * 5, _WIDTH)
         self.dropout = nn.Dropout(dropout)
 
     def forward(self, patches: Tensor) -> Tensor:
         patches = patches.contiguous(memory_format=torch.channels_last)
         for conv in self.convs:
-            patches = F.relu(conv(patches))
+            patches = F.relu(conv(patches), inplace=True)
         encoded: Tensor = self.dropout(F.relu(self.project(patches.flatten(1))))
         return encoded
 
@@ -179,13 +181,15 @@ class AgentFrameNetwork(nn.Module):
         self.modes = nn.Parameter(torch.randn(config.modes, _HIDDEN))
         self.propose_hidden = nn.Linear(_HIDDEN, _HIDDEN)
         self.propose = nn.Linear(_HIDDEN, 2 * STEPS + 2)
-        read = 4
-        if config.far_map:
-            read += 3 * len(_READ_LATERAL_M) * len(_READ_AHEAD_M)
-        if config.neighbor_types:
-            read += 2
-        self.read = nn.Linear(read, _STEP_WIDTH)
-        self.refine_hidden = nn.Linear(_HIDDEN + STEPS * _STEP_WIDTH, _HIDDEN)
+        self.read_state = nn.Linear(4, _STEP_WIDTH)
+        points = len(_READ_LATERAL_M) * len(_READ_AHEAD_M)
+        self.read_map = (
+            nn.ModuleList([nn.Linear(points, _STEP_WIDTH, bias=False) for _ in range(3)])
+            if config.far_map
+            else None
+        )
+        self.read_neighbors = nn.Linear(2, _STEP_WIDTH, bias=False) if config.neighbor_types else None
+        self.refine_hidden = nn.Linear(_HIDDEN + STEPS // _READ_EVERY * _STEP_WIDTH, _HIDDEN)
         self.refine = nn.Linear(_HIDDEN, 2 * STEPS)
         self.sigma = nn.Linear(_HIDDEN, 2 * STEPS)
         self.logits = nn.Linear(_HIDDEN, 1)
@@ -229,7 +233,7 @@ class AgentFrameNetwork(nn.Module):
         heading = _MAX_HEADING_CORRECTION * torch.tanh(start[..., 0])
         speed = speed + _MAX_SPEED_CORRECTION * torch.tanh(start[..., 1])
         proposal = drive(controls * scale, heading, speed)
-        read = F.relu(self.read(self._read(proposal, features, context)))
+        read = self._read(proposal, features, context)
         refined = F.relu(self.refine_hidden(torch.cat([hidden, read.flatten(2)], dim=-1)))
         controls = controls + self.refine(refined).unflatten(-1, (STEPS, 2))
         path = drive(controls * scale, heading, speed)
@@ -260,30 +264,34 @@ class AgentFrameNetwork(nn.Module):
         modes = self.decode(self.encode(features, context), features, context)
         mean = torch.stack([modes.path.x, modes.path.y], dim=-1)[:, :, :steps]
         covariance = self.covariance(modes)[:, :, :steps]
-        cos, sin = features["heading"].cos(), features["heading"].sin()
+        cos, sin = (part.to(mean.dtype) for part in (features["heading"].cos(), features["heading"].sin()))
         turn = torch.stack([cos, -sin, sin, cos], dim=-1).unflatten(-1, (2, 2))[:, None, None]
         mean = (turn @ mean[..., None])[..., 0]
         covariance = turn @ covariance @ turn.transpose(-1, -2)
         return F.log_softmax(modes.logits / self.temperature, dim=-1), Positions(mean, covariance)
 
     def _read(self, path: Path, features: Features, context: Context) -> Tensor:
-        """Return what is met at each step of each mode: [N, K, T, R]. No gradient reaches the path."""
-        x, y, heading, speed = (part.detach() for part in path)
-        full = context is Context.FULL
-        read = [torch.stack([x / 30, y / 30, heading, speed / 15], dim=-1)]
-        if self.far_map_encoder is not None:
+        """Return what is met at every other step of each mode, encoded: [N, K, T/2, 32]. No gradient reaches the path.
+
+        The parts go through slices of one linear layer, as joining them would copy more than it computes.
+        """
+        x, y, heading, speed = (part.detach()[..., _READ_EVERY - 1 :: _READ_EVERY] for part in path)
+        where = torch.stack([x / 30, y / 30, heading, speed / 15], dim=-1)
+        read = self.read_state(where)
+        if context is not Context.FULL:
+            return F.relu(read, inplace=True)
+        if self.read_map is not None:
             lateral = x.new_tensor(_READ_LATERAL_M).repeat(len(_READ_AHEAD_M))
             ahead = x.new_tensor(_READ_AHEAD_M).repeat_interleave(len(_READ_LATERAL_M))
-            if full:
-                cos, sin = heading.cos()[..., None], heading.sin()[..., None]
-                px = x[..., None] + cos * ahead - sin * lateral
-                py = y[..., None] + sin * ahead + cos * lateral
-                read.append(read_patch(features["far_map"], px, py, FAR).flatten(3))
-            else:
-                read.append(x.new_zeros(*x.shape, 3 * len(lateral)))
-        if self.neighbor_encoder is not None:
-            read.append(_closeness(x, y, features) if full else x.new_zeros(*x.shape, 2))
-        return torch.cat(read, dim=-1)
+            cos, sin = heading.cos()[..., None], heading.sin()[..., None]
+            px = x[..., None] + cos * ahead - sin * lateral
+            py = y[..., None] + sin * ahead + cos * lateral
+            layers = read_patch(features["far_map"], px, py, FAR)  # [N, 3, K, T, P]
+            for layer, values in zip(self.read_map, layers.unbind(1), strict=True):
+                read = read + layer(values)
+        if self.read_neighbors is not None:
+            read = read + self.read_neighbors(_closeness(x, y, features))
+        return F.relu(read, inplace=True)
 
 
 def read_patch(patches: Tensor, x: Tensor, y: Tensor, geometry: PatchGeometry) -> Tensor:
@@ -296,14 +304,14 @@ def read_patch(patches: Tensor, x: Tensor, y: Tensor, geometry: PatchGeometry) -
         geometry: of the patches.
 
     Returns:
-        [N, …, 3].
+        [N, 3, …].
     """
     size = geometry.size
     row = (x * geometry.pixels_per_meter + geometry.rows_behind + 0.5) * (2 / size) - 1
     column = (y * geometry.pixels_per_meter + geometry.columns_right + 0.5) * (2 / size) - 1
     grid = torch.stack([column, row], dim=-1).flatten(1, -2)[:, None]  # [N, 1, P, 2]
     values = F.grid_sample(patches, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
-    return values[:, :, 0].transpose(1, 2).unflatten(1, x.shape[1:])
+    return values.unflatten(-1, x.shape[1:])[:, :, 0]
 
 
 def _neighbors(features: Features, full: bool) -> tuple[Tensor, Tensor]:
@@ -316,7 +324,8 @@ def _neighbors(features: Features, full: bool) -> tuple[Tensor, Tensor]:
 def _closeness(x: Tensor, y: Tensor, features: Features) -> Tensor:
     """Return how near each step comes to where a neighbour will be if it goes on as now: [N, K, T, 2]."""
     neighbors = features["neighbors"]
-    seconds = STEP_SECONDS * torch.arange(1, x.shape[-1] + 1, dtype=x.dtype, device=x.device)
+    steps = torch.arange(_READ_EVERY, STEPS + 1, _READ_EVERY, dtype=x.dtype, device=x.device)
+    seconds = STEP_SECONDS * steps
     place = (
         30 * neighbors[:, :, None, 0:2] + 15 * neighbors[:, :, None, 4:6] * seconds[:, None]
     )  # [N, M, T, 2]

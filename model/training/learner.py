@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from model.cvae import CvaeNetworks
 from model.data.hiding import hide_context
+from model.data.packing import unpack_patches
 from model.forecaster import Features
 from model.network_forecaster import Networks
 from model.networks.agent_frame import AgentFrameNetwork
@@ -159,7 +160,9 @@ class AgentFrameLearner(DescentLearner):
 
     def step(self, batches: Sequence[Batch], weights: Weights, rate: float) -> dict[str, Tensor]:
         (batch,) = batches
-        features = hide_context(batch.features) if self._hide else batch.features
+        features = dict(hide_context(batch.features) if self._hide else batch.features)
+        for name in features.keys() & {"map", "far_map"}:
+            features[name] = unpack_patches(features[name])
         future = turned(batch.future, -features["heading"].to(batch.future.dtype))
         loss = mixture_objective(self.network, features, future, self._weights, self._contrast)
         self.descend(loss.value, rate)

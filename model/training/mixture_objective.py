@@ -114,7 +114,7 @@ def _terms(
         value = value + weights.choice * choice
         named["choice"] = choice
     if weights.off_road and context is Context.FULL and "far_map" in features:
-        road = read_patch(features["far_map"], modes.path.x, modes.path.y, FAR)[..., 0]
+        road = read_patch(features["far_map"], modes.path.x, modes.path.y, FAR)[:, 0]
         off = (log_weights.exp() * F.relu(-road).mean(dim=-1)).sum(dim=1).mean()
         value = value + weights.off_road * off
         named["off_road"] = off

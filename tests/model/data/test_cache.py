@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from model.data import cache_layout
 from model.data.cache import Cache, CacheKey, build_cache
 from model.data.protocols import frame_scene
 from model.data.scenes import DataError, Pair, SceneRecord
@@ -110,18 +109,12 @@ def test_a_cache_of_boxes(tmp_path: Path) -> None:
     assert (cache.surroundings[..., 3] > 0).any()
 
 
-def test_caches_of_histories_hold_no_boxes_and_do_not_hang_on_how_they_are_made(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_caches_of_histories_hold_no_boxes_and_are_found_as_before_there_were_any(tmp_path: Path) -> None:
     _build(tmp_path / "histories")
-    _build(tmp_path / "boxes", config=CoverNetConfig())
-    monkeypatch.setattr(cache_layout, "_DRAWN_BY", (cache_layout,))
     assert Cache.open(tmp_path / "histories").surroundings is None
-    with pytest.raises(DataError, match="build the cache anew"):
-        Cache.open(tmp_path / "boxes")
     manifest = tmp_path / "histories/manifest.json"
     content = json.loads(manifest.read_text())
-    content["key"].pop("drawn")  # as before there were boxes
+    content["key"].pop("drawn")
     manifest.write_text(json.dumps(content))
     Cache.open(tmp_path / "histories", KEY)
 
@@ -163,13 +156,6 @@ def test_a_cache_of_something_else_is_refused(tmp_path: Path, change: dict[str, 
         Cache.open(tmp_path / "cache", KEY.model_copy(update=change))
 
 
-def test_a_cache_made_by_other_code_is_stale(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    _build(tmp_path / "cache")
-    monkeypatch.setattr(cache_layout, "_DERIVED_BY", (cache_layout,))
-    with pytest.raises(DataError, match="build the cache anew"):
-        Cache.open(tmp_path / "cache")
-
-
 def _manifest(change: dict[str, object]) -> Callable[[Path], None]:
     def apply(folder: Path) -> None:
         file = folder / "manifest.json"
@@ -184,7 +170,7 @@ def _manifest(change: dict[str, object]) -> Callable[[Path], None]:
         (lambda folder: (folder / "manifest.json").unlink(), "manifest.json: there is no such file"),
         (lambda folder: (folder / "manifest.json").write_text("{"), "manifest.json: cannot be read"),
         (lambda folder: (folder / "manifest.json").write_text("[1]"), r"manifest.json: "),
-        (_manifest({"format_version": 99}), "format version 99, not 1"),
+        (_manifest({"format_version": 99}), "format version 99, not 2"),
         (_manifest({"pairs": 0}), "manifest.json: pairs"),
         (_manifest({"pairs": 3}), r"\.npy: holds .* not .*3"),
         (_manifest({"more": 3}), "manifest.json: more"),
