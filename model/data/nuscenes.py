@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from model.arrays import Floats
-from model.data.checks import check_pairs
+from model.data.checks import FUTURE_STEPS, check_pairs
 from model.data.nuscenes_map import VectorMap
 from model.data.scenes import DataError, Pair, SceneRecord, Track
 from model.scene import AgentType, Raster
@@ -31,7 +31,17 @@ _VERSIONS = {
     "train": "v1.0-trainval",
     "train_val": "v1.0-trainval",
     "val": "v1.0-trainval",
+    "mini_train_standing": "v1.0-mini",
+    "mini_val_standing": "v1.0-mini",
 }
+_STANDING = {"mini_train_standing": "mini_train", "mini_val_standing": "mini_val"}
+"""Splits of standing vehicles, and the official splits whose scenes they look at."""
+_HELD_BACK = frozenset({"scene-0061"})
+"""Of mini_train, but also of the challenge's train_val: what is judged on is not trained on."""
+_STANDING_STEPS = 4
+"""Frames before the present in which a standing vehicle does not move (2 s), and between two of its pairs."""
+_STANDING_METERS = 0.3
+"""What a standing vehicle seems to move at most: annotations are that exact."""
 _CATEGORIES = {
     "vehicle.bicycle": AgentType.CYCLIST,
     "vehicle.motorcycle": AgentType.CYCLIST,
@@ -64,6 +74,7 @@ class NuscenesReader:
             self._map_api = import_module("nuscenes.map_expansion.map_api").NuScenesMap
             self._helper = import_module("nuscenes.prediction").PredictHelper
             self._challenge = import_module("nuscenes.eval.prediction.splits").get_prediction_challenge_split
+            self._official = import_module("nuscenes.utils.splits").create_splits_scenes
         except ImportError as error:
             fault = "reading nuScenes needs nuscenes-devkit (pip install nuscenes-devkit==1.2.0)"
             raise ImportError(f"{fault}: {error}") from error
@@ -78,7 +89,12 @@ class NuscenesReader:
 
     @property
     def splits(self) -> tuple[str, ...]:
-        """Splits of the prediction challenge; two of them on v1.0-mini."""
+        """Splits of the prediction challenge, two of them on v1.0-mini, and of standing vehicles.
+
+        The latter have all vehicles but the ego vehicle that stood for 2 s and whose next 6 s are annotated,
+        at frames 2 s apart, moving later or not; no others (the challenge asks for hardly any that stay).
+        ``mini_train_standing`` leaves scene-0061 out, as that one is also of the challenge's train_val.
+        """
         return tuple(_VERSIONS)
 
     def scenes(self, split: str) -> Iterator[SceneRecord]:
@@ -92,8 +108,14 @@ class NuscenesReader:
         database = self._database(_VERSIONS[split])
         with _naming(database.table_root):
             helper = self._helper(database)
+        scenes = sorted(database.scene, key=lambda scene: str(scene["name"]))
+        if split in _STANDING:
+            names = {*self._official()[_STANDING[split]]} - _HELD_BACK
+            records = (self._record(database, helper, scene) for scene in scenes if scene["name"] in names)
+            yield from (record for record in records if record.pairs)
+            return
         asked = self._asked(database, split)
-        for scene in sorted(database.scene, key=lambda scene: str(scene["name"])):
+        for scene in scenes:
             if scene["token"] in asked:
                 yield self._record(database, helper, scene, asked[scene["token"]])
 
@@ -119,8 +141,13 @@ class NuscenesReader:
         return asked
 
     def _record(
-        self, database: Any, helper: Any, scene: dict[str, Any], asked: Sequence[tuple[str, str]]
+        self,
+        database: Any,
+        helper: Any,
+        scene: dict[str, Any],
+        asked: Sequence[tuple[str, str]] | None = None,
     ) -> SceneRecord:
+        """A scene with the pairs asked for, as instance and sample tokens; None: of standing vehicles."""
         where = f"{database.table_root}: {scene['name']}"
         with _naming(where):
             samples = list(_samples(database, scene))
@@ -128,6 +155,12 @@ class NuscenesReader:
             location = helper.get_map_name_from_sample_token(scene["first_sample_token"])
             rows = {track.id: row for row, track in enumerate(tracks)}
             frames = {sample["token"]: frame for frame, sample in enumerate(samples)}
+            if asked is None:
+                asked = [
+                    (track.id, samples[frame]["token"])
+                    for track in tracks
+                    for frame in _standing_frames(track)
+                ]
             pairs = [
                 Pair(rows[instance], frames[sample], f"{instance}_{sample}") for instance, sample in asked
             ]
@@ -184,6 +217,22 @@ def _tracks(database: Any, samples: Sequence[dict[str, Any]]) -> list[Track]:
         return Track(name, types[name], number, pose[:, :2].copy(), _yaw(pose[:, 2:]))
 
     return [track(name) for name in (EGO, *sorted(types.keys() - {EGO}))]
+
+
+def _standing_frames(track: Track) -> list[int]:
+    """Frames at which a vehicle, not the ego vehicle, has stood for 2 s and its next 6 s are known."""
+    chosen: list[int] = []
+    if track.type is not AgentType.VEHICLE or track.id == EGO:
+        return chosen
+    around = np.arange(-_STANDING_STEPS, FUTURE_STEPS + 1)
+    for frame in track.frames.tolist():
+        if chosen and frame < chosen[-1] + _STANDING_STEPS:
+            continue
+        places = track.positions(frame + around)
+        past = places[: _STANDING_STEPS + 1] - places[_STANDING_STEPS]
+        if np.isfinite(places).all() and np.hypot(*past.T).max() < _STANDING_METERS:
+            chosen.append(frame)
+    return chosen
 
 
 def _agent_type(category: str) -> AgentType | None:

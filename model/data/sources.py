@@ -5,6 +5,7 @@ from pathlib import Path
 
 from model.data.nuscenes_pred import NuscenesPredReader
 from model.data.scenes import DataError, Reader
+from model.data.synthetic import SyntheticReader
 from model.forecaster import Protocol
 
 
@@ -17,8 +18,12 @@ def _official(path: Path) -> Reader:
         raise DataError(f"official nuScenes data needs the extra benchmark: {error}") from error
 
 
-READERS: dict[str, Callable[[Path], Reader]] = {"nuscenes_pred": NuscenesPredReader, "nuscenes": _official}
-"""Readers of data sets by the KIND of KIND:PATH."""
+READERS: dict[str, Callable[[Path], Reader]] = {
+    "nuscenes_pred": NuscenesPredReader,
+    "nuscenes": _official,
+    "synthetic": SyntheticReader,
+}
+"""Readers of data sets by the KIND of KIND:PATH; the path of made-up data is its seed."""
 
 
 def parse_data(text: str) -> tuple[str, Path]:

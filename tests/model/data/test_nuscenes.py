@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from model.data.checks import check_pairs
 from model.data.nuscenes import EGO, MARGIN, NuscenesReader
 from model.data.nuscenes_pred import NuscenesPredReader
 from model.data.scenes import DataError, SceneRecord, Track
@@ -201,6 +202,48 @@ def test_a_scene_in_all_detail(made: Path) -> None:
     assert layers(405, 705.6) == [1, 0, 0]
 
 
+@needs_devkit
+def test_standing_vehicles_of_the_mini_scenes(dataroot: Path) -> None:
+    reader = NuscenesReader(dataroot)
+    names = {}
+    for split, pairs in (("mini_train_standing", 341), ("mini_val_standing", 276)):
+        found = list(reader.scenes(split))
+        names[split] = [record.name for record in found]
+        assert names[split] == sorted(names[split])
+        assert sum(len(record.pairs) for record in found) == pairs
+        moved = []
+        for record in found:
+            check_pairs(record.name, record.tracks, record.pairs)
+            last: dict[int, int] = {}
+            for pair in record.pairs:
+                one = record.tracks[pair.track]
+                assert one.id != EGO
+                places = one.positions(pair.frame + np.arange(-4, 13))
+                assert np.isfinite(places).all()
+                assert np.hypot(*(places[:5] - places[4]).T).max() < 0.3
+                assert pair.frame - last.get(pair.track, -4) >= 4
+                last[pair.track] = pair.frame
+                moved.append(float(np.hypot(*(places[10] - places[4]))))
+        # Hardly any moves within 3 s
+        assert np.mean(np.array(moved) > 2) < 0.02
+    assert len(names["mini_train_standing"]) == 7
+    assert names["mini_val_standing"] == ["scene-0103", "scene-0916"]
+    assert SCENE not in names["mini_train_standing"]
+
+
+@needs_devkit
+def test_pairs_of_a_standing_vehicle(made: Path) -> None:
+    # It is of the challenge's train_val
+    assert list(NuscenesReader(made).scenes("mini_train_standing")) == []
+    _edit("scene", lambda rows: rows[0].update(name="scene-0655"))(made)
+    (record,) = NuscenesReader(made).scenes("mini_train_standing")
+    row = [one.id for one in record.tracks].index(token("parked"))
+    # Of frames 4 to 7, which have whole pasts and futures, the first: the next one is 2 s later
+    assert [(pair.track, pair.frame) for pair in record.pairs] == [(row, 4)]
+    assert record.pairs[0].token == f"{token('parked')}_{token('sample 4')}"
+    assert list(NuscenesReader(made).scenes("mini_val_standing")) == []
+
+
 def _edit(table: str, change: Callable[[list[dict[str, object]]], object]) -> Callable[[Path], None]:
     def apply(root: Path) -> None:
         file = root / f"v1.0-mini/{table}.json"
@@ -248,7 +291,8 @@ def test_bad_files_are_named(made: Path, damage: Callable[[Path], object], file:
 @needs_devkit
 def test_splits_of_data_that_is_not_there(made: Path) -> None:
     reader = NuscenesReader(made)
-    assert reader.splits == ("mini_train", "mini_val", "train", "train_val", "val")
+    challenge = ("mini_train", "mini_val", "train", "train_val", "val")
+    assert reader.splits == (*challenge, "mini_train_standing", "mini_val_standing")
     with pytest.raises(DataError, match=r"v1\.0-trainval: there is no such folder"):
         next(reader.scenes("train"))
     with pytest.raises(DataError, match="no split 'test'"):

@@ -15,7 +15,7 @@ def test_data_is_a_kind_and_a_path() -> None:
 
 @pytest.mark.parametrize("text", ["nowhere", "nuscenes_pred:", "other:/path", ":/path"])
 def test_what_is_no_data_is_said(text: str) -> None:
-    with pytest.raises(DataError, match="KIND:PATH with KIND one of nuscenes_pred, nuscenes"):
+    with pytest.raises(DataError, match="KIND:PATH with KIND one of nuscenes_pred, nuscenes, synthetic"):
         parse_data(text)
 
 
