@@ -19,6 +19,8 @@ KEY_FIGURES = {
     "FDE-f 6 s": "fde_f_6s_m",
     "minADE_5": "min_ade_5_m",
     "minADE_10": "min_ade_10_m",
+    "merged minADE_5": "merged_min_ade_5_m",
+    "merged brier-minFDE_5": "merged_brier_min_fde_5_m",
     "NLL": "nll",
     "D, std": "dispersion_std_m",
     "C(1 m)": "convergence_1m_s",

@@ -120,7 +120,7 @@ def _scores(
 
 
 def _result(key: str, model: Model | None, known: _Sums, mismatch_m: Floats | None) -> ModelResult:
-    metrics = known.means.means() | known.instants.means()
+    metrics = known.means.figures() | known.instants.means()
     if mismatch_m is not None and _FDE in known.each:
         metrics |= hardest_fde(known.each[_FDE], mismatch_m)
     instants = known.instants.count(METRICS[0]) if METRICS[0] in known.instants.names() else 0

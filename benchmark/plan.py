@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.arrays import Floats, Ints
+from model.arrays import Bools, Floats, Ints
 from model.data.checks import STEPS_AHEAD, check_pairs
 from model.data.scenes import DataError, Pair, Reader, SceneRecord
 
@@ -51,6 +51,10 @@ class PlannedScene:
     def origin(self) -> Floats:
         """[N, 2], m, ground frame: where the pairs' agents are."""
         return self._positions(np.array(0))
+
+    def stood(self) -> Bools:
+        """[N], whether the pairs' agents stood before now (``model.metrics.standing``)."""
+        return self.record.stood(self.pairs)
 
     def _positions(self, ahead: Ints) -> Floats:
         """Where the pairs' agents are so many frames later: [N, ..., 2], m."""

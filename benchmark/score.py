@@ -89,6 +89,7 @@ def _score(scene: PlannedScene, answers: SceneAnswers, truth: Floats, judging: J
             (numbers + judging.seed * SEEDS).tolist(),
             samples=judging.samples,
             draws=judging.draws,
+            stood=scene.stood()[answers.instances],
         )
         score = replace(score, metrics=metrics)
     if judging.consistency:
@@ -111,7 +112,12 @@ def _oracle(
         }
         best = oracle_mixture(mixtures, truth[instances])
         metrics = oracle_figures(
-            instance_metrics(best, truth[instances], [scene.record.raster] * len(instances))
+            instance_metrics(
+                best,
+                truth[instances],
+                [scene.record.raster] * len(instances),
+                stood=scene.stood()[instances],
+            )
         )
     score = SceneScore(instances + scene.first, metrics)
     if judging.consistency:

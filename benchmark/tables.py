@@ -12,6 +12,7 @@ from model.evaluation.published import (
     PublishedConsistency,
     PublishedHardCases,
 )
+from model.evaluation.tables import MERGED, MERGED_NOTE, STOOD_NOTE, WITHOUT_STANDING
 from model.evaluation.text_tables import Table, document, metrics_table, number, signed
 from model.forecaster import Protocol
 from model.metrics.convergence import RANGES_M
@@ -75,6 +76,8 @@ def _all(results: Results) -> list[_Made]:
         _consistency(results),
         _hard_cases(results),
         _multimodal(results),
+        _merged(results),
+        _moving(results),
         _likelihood(results),
         _latency(results),
         _beside(results, 1, DISPLACEMENT, PUBLISHED),
@@ -140,10 +143,28 @@ def _multimodal(results: Results) -> _Made:
     columns |= {f"minFDE_{k}": f"min_fde_{k}_m" for k in TOP_K}
     columns |= {f"miss rate {k}": f"miss_rate_{k}" for k in TOP_K}
     note = (
-        f"{results.statement()}. The best of the k likeliest modes, at 6 s, m; miss: every one of them is "
-        f"{MISS_TOLERANCE_M:g} m off somewhere."
+        f"{results.statement()}. The best of the k likeliest modes as the model has them, at 6 s, m; miss: "
+        f"every one of them is {MISS_TOLERANCE_M:g} m off somewhere."
     )
-    return _metrics(results, "4. Modes", note, columns, "no forecasts")
+    return _metrics(results, "4. Raw modes", note, columns, "no forecasts")
+
+
+def _merged(results: Results) -> _Made:
+    note = (
+        f"{results.statement()}. Modes that a planner would not tell apart merged into one, weights summed; "
+        f"{MERGED_NOTE}"
+    )
+    return _metrics(results, "4.1 Merged modes", note, MERGED, "no forecasts of a version that merges modes")
+
+
+def _moving(results: Results) -> _Made:
+    note = (
+        f"{results.statement()}. The main figures without the pairs whose agent stood before now: "
+        f"{STOOD_NOTE} Raw: the model's own modes; merged: as in table 4.1."
+    )
+    return _metrics(
+        results, "4.2 Without those that stood", note, WITHOUT_STANDING, "no figures without them"
+    )
 
 
 def _likelihood(results: Results) -> _Made:

@@ -6,7 +6,8 @@ from typing import Protocol as Interface
 
 import numpy as np
 
-from model.arrays import Floats, Ints
+from model.arrays import Bools, Floats, Ints
+from model.metrics.standing import STANDING_FRAMES, stood
 from model.scene import AgentType, Raster
 
 
@@ -56,6 +57,15 @@ class SceneRecord:
     pairs: Sequence[Pair]
     """Of the split that was read, ordered by frame, then by track."""
     raster: Raster
+
+    def stood(self, pairs: Sequence[Pair]) -> Bools:
+        """Return which pairs' agents stood before now (``model.metrics.standing``): [N].
+
+        Args:
+            pairs: N of this scene's.
+        """
+        back = np.arange(-STANDING_FRAMES, 1)
+        return stood(np.stack([self.tracks[pair.track].positions(pair.frame + back) for pair in pairs]))
 
 
 class Reader(Interface):

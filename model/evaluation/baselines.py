@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model import physics
-from model.arrays import Floats
+from model.arrays import Bools, Floats
 from model.data.checks import FUTURE_STEPS, STEPS_AHEAD, check_pairs
 from model.data.protocols import SceneFrames
 from model.data.scenes import DataError, Pair, Reader, SceneRecord
@@ -30,6 +30,8 @@ class ScenePairs:
     truth: Floats
     """[N, 12, 2], m, ground frame."""
     raster: Raster
+    stood: Bools
+    """[N], whether the agent stood before now (``model.metrics.standing``)."""
 
 
 def judge_baselines(
@@ -75,12 +77,19 @@ def judge_baselines(
         rasters, seeds = [pairs.raster] * count, range(done, done + count)
         for one in baselines:
             metrics = instance_metrics(
-                mixtures[one.info.name], pairs.truth, rasters, seeds, samples=samples, draws=draws
+                mixtures[one.info.name],
+                pairs.truth,
+                rasters,
+                seeds,
+                samples=samples,
+                draws=draws,
+                stood=pairs.stood,
             )
             means[one.info.full_name].add(metrics)
         if oracle:
             best = oracle_mixture(mixtures, pairs.truth)
-            means[ORACLE].add(oracle_figures(instance_metrics(best, pairs.truth, rasters)))
+            metrics = instance_metrics(best, pairs.truth, rasters, stood=pairs.stood)
+            means[ORACLE].add(oracle_figures(metrics))
         done += count
         tick(done)
     if not done:
@@ -118,4 +127,4 @@ def _scene(
         for forecaster, part in zip(forecasters, parts, strict=True):
             part.append(forecaster.prepare(scene, targets))
     truth = np.stack([record.tracks[pair.track].positions(pair.frame + STEPS_AHEAD) for pair in pairs])
-    return ScenePairs([join(part) for part in parts], truth, record.raster)
+    return ScenePairs([join(part) for part in parts], truth, record.raster, record.stood(pairs))

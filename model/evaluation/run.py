@@ -100,14 +100,16 @@ class Evaluation:
         subjects = self.subjects
         rows = [_row(one.info, judged[one.info.full_name], learned=False) for one in subjects.baselines]
         if subjects.oracle:
-            rows.append(Row(ORACLE, "", learned=False, trained_on="", metrics=judged[ORACLE].metrics.means()))
+            rows.append(
+                Row(ORACLE, "", learned=False, trained_on="", metrics=judged[ORACLE].metrics.figures())
+            )
         rows += [_row(one.info, judged[one.info.full_name], learned=True) for one in subjects.learned]
         return tuple(rows)
 
 
 def _row(info: ModelInfo, judged: Judged, learned: bool) -> Row:
-    ablated = {without.value: means.means() for without, means in judged.ablated.items()}
-    return Row(info.name, info.version, learned, info.trained_on, judged.metrics.means(), ablated)
+    ablated = {without.value: means.figures() for without, means in judged.ablated.items()}
+    return Row(info.name, info.version, learned, info.trained_on, judged.metrics.figures(), ablated)
 
 
 def _pairs(means: MetricMeans) -> int:

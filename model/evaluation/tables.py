@@ -8,12 +8,59 @@ from model.evaluation.published import PUBLISHED
 from model.evaluation.results import Results, Row
 from model.evaluation.text_tables import NOTHING, Table, document, metrics_table, number
 from model.metrics.displacement import HORIZONS_S
+from model.metrics.standing import STANDING_FRAMES, STANDING_M
+from model.scene import STEP_SECONDS
+
+MERGED = {
+    "minADE_5": "merged_min_ade_5_m",
+    "minADE_10": "merged_min_ade_10_m",
+    "minFDE_5": "merged_min_fde_5_m",
+    "minFDE_10": "merged_min_fde_10_m",
+    "miss rate 5": "merged_miss_rate_5",
+    "miss rate 10": "merged_miss_rate_10",
+    "brier-minFDE_5": "merged_brier_min_fde_5_m",
+    "hold 90 %, median": "merged_modes_90_median",
+    "hold 90 %, mean": "merged_modes_90",
+    "first weight": "merged_first_weight",
+    "ADE": "ade_merged_6s_m",
+    "FDE": "fde_merged_6s_m",
+}
+"""Figures of merged modes by heading."""
+MERGED_NOTE = (
+    "best of the k likeliest merged modes at 6 s, m; brier-minFDE: minFDE and (1 − p)², p the probability of "
+    "the mode that ends nearest; hold 90 %: how many merged modes have 90 % of the probability; first "
+    "weight: probability of the likeliest one; ADE and FDE: of that one."
+)
+"""What they are."""
+WITHOUT_STANDING = {
+    "FDE": "moving_fde_ml_6s_m",
+    "OffR": "moving_off_road_ml",
+    "OffR-f": "moving_off_road_f",
+    "NLL": "moving_nll",
+    "inside 90 %": "moving_inside_90",
+    "minADE_5, raw": "moving_min_ade_5_m",
+    "minADE_10, raw": "moving_min_ade_10_m",
+    "miss rate 5, raw": "moving_miss_rate_5",
+    "FDE, merged": "moving_fde_merged_6s_m",
+    "minADE_5, merged": "moving_merged_min_ade_5_m",
+    "minADE_10, merged": "moving_merged_min_ade_10_m",
+    "miss rate 5, merged": "moving_merged_miss_rate_5",
+    "brier-minFDE_5, merged": "moving_merged_brier_min_fde_5_m",
+    "hold 90 %, median": "moving_merged_modes_90_median",
+}
+"""The main figures without those that stood, by heading."""
+STOOD_NOTE = (
+    f"for {STANDING_FRAMES * STEP_SECONDS:g} s it was seen at every frame, never {STANDING_M:g} m from where "
+    "it is."
+)
+"""Who they are."""
 
 
 def tables(results: Results) -> list[Table]:
-    """The likeliest trajectory, the whole forecast, the paper's figures beside ours where there are any,
-    and, where it was asked for, what the context is worth."""
-    made = [_most_likely(results), _whole(results)]
+    """The likeliest trajectory, the whole forecast, the merged modes, the main figures without the agents
+    that stood, the paper's figures beside ours where there are any, and, where it was asked for, what the
+    context is worth."""
+    made = [_most_likely(results), _whole(results), _merged(results), _moving(results)]
     if any(row.name in PUBLISHED for row in results.rows):
         made.append(_beside_the_paper(results))
     if results.ablate:
@@ -40,10 +87,10 @@ def _whole(results: Results) -> Table:
         "FDE-f": "fde_f_6s_m",
         "OffR-f": "off_road_f",
         "NLL": "nll",
-        "minADE_5": "min_ade_5_m",
-        "minADE_10": "min_ade_10_m",
-        "miss rate 5": "miss_rate_5",
-        "miss rate 10": "miss_rate_10",
+        "minADE_5, raw": "min_ade_5_m",
+        "minADE_10, raw": "min_ade_10_m",
+        "miss rate 5, raw": "miss_rate_5",
+        "miss rate 10, raw": "miss_rate_10",
         "inside 50 %": "inside_50",
         "inside 90 %": "inside_90",
         "inside 99 %": "inside_99",
@@ -54,6 +101,22 @@ def _whole(results: Results) -> Table:
         "truth is in the region that is said to hold p %."
     )
     return _plain("The whole forecast", note, columns, results.rows)
+
+
+def _merged(results: Results) -> Table:
+    note = (
+        f"{results.statement()}. Modes that a planner would not tell apart merged into one, weights summed; "
+        f"{MERGED_NOTE}"
+    )
+    return _plain("Merged modes", note, MERGED, results.rows)
+
+
+def _moving(results: Results) -> Table:
+    note = (
+        f"{results.statement()}. The main figures without the pairs whose agent stood before now: "
+        f"{STOOD_NOTE} Raw: the model's own modes."
+    )
+    return _plain("Without those that stood", note, WITHOUT_STANDING, results.rows)
 
 
 def _beside_the_paper(results: Results) -> Table:

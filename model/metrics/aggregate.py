@@ -1,9 +1,9 @@
 """Means over many batches without keeping them."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -11,6 +11,8 @@ from model.arrays import Floats
 
 INFINITE: Final = 1e300
 """Values beyond it count as infinite: sums of what is below cannot overflow."""
+COUNTED: Final = ("merged_modes_90", "moving_merged_modes_90")
+"""Metrics that are small whole numbers: how often each occurs is kept, for their medians."""
 
 
 @dataclass
@@ -25,6 +27,8 @@ class _Sum:
     """Infinite."""
     below: int = 0
     """Negative infinite."""
+    occurrences: list[list[float]] = field(default_factory=list)
+    """Of a metric that is counted: each value and how often it came, ascending; of others nothing."""
 
     def add_values(self, values: Floats) -> None:
         known = values[~np.isnan(values)]
@@ -34,8 +38,15 @@ class _Sum:
         self.above += int((known > INFINITE).sum())
         self.below += int((known < -INFINITE).sum())
 
+    def add_occurrences(self, occurrences: Iterable[Sequence[float]]) -> None:
+        found: dict[float, float] = {}
+        for value, times in (*self.occurrences, *occurrences):
+            found[value] = found.get(value, 0) + times
+        self.occurrences = [[value, times] for value, times in sorted(found.items())]
+
     def add_sum(self, other: "_Sum") -> None:
         self.add_parts(other.parts)
+        self.add_occurrences(other.occurrences)
         self.count += other.count
         self.missing += other.missing
         self.above += other.above
@@ -54,6 +65,13 @@ class _Sum:
         if self.above or self.below:
             return math.inf if self.above else -math.inf
         return math.fsum(self.parts) / self.count
+
+    def median(self) -> float:
+        if not self.occurrences:
+            return math.nan
+        values, times = np.array(self.occurrences).T
+        middle = [(self.count - 1) // 2, self.count // 2]
+        return float(values[np.searchsorted(np.cumsum(times), middle, side="right")].mean())
 
 
 class MetricMeans:
@@ -74,7 +92,12 @@ class MetricMeans:
             batch: [n] (or any shape, all elements alike) by metric. Batches need not have the same metrics.
         """
         for name, values in batch.items():
-            self._sums.setdefault(name, _Sum()).add_values(np.asarray(values, dtype=np.float64))
+            array = np.asarray(values, dtype=np.float64)
+            total = self._sums.setdefault(name, _Sum())
+            total.add_values(array)
+            if name in COUNTED:
+                found, times = np.unique(array[~np.isnan(array)], return_counts=True)
+                total.add_occurrences(zip(found.tolist(), times.tolist(), strict=True))
 
     def merge(self, other: "MetricMeans") -> None:
         """Adds all that another one holds."""
@@ -105,12 +128,20 @@ class MetricMeans:
         """Mean of each metric, by name."""
         return {name: total.mean() for name, total in self._sums.items()}
 
-    def state(self) -> dict[str, dict[str, list[float] | int]]:
+    def medians(self) -> dict[str, float]:
+        """Median of each of the metrics that are counted, as ``<metric>_median``; NaN if none has it."""
+        return {f"{name}_median": self._sums[name].median() for name in COUNTED if name in self._sums}
+
+    def figures(self) -> dict[str, float]:
+        """Means, and the medians that there are, by name."""
+        return self.means() | self.medians()
+
+    def state(self) -> dict[str, dict[str, Any]]:
         """All that is known, as JSON can hold it without loss (Python's floats come back as they were)."""
         return {name: asdict(total) for name, total in self._sums.items()}
 
     @classmethod
-    def from_state(cls, state: Mapping[str, Mapping[str, list[float] | int]]) -> "MetricMeans":
+    def from_state(cls, state: Mapping[str, Mapping[str, Any]]) -> "MetricMeans":
         """The one that gave this ``state``.
 
         Raises:
@@ -125,8 +156,10 @@ class MetricMeans:
                     "missing": int(missing),
                     "above": int(above),
                     "below": int(below),
+                    "occurrences": list(occurrences),
                 }:
-                    means._sums[name] = _Sum([float(p) for p in parts], count, missing, above, below)
+                    total = means._sums[name] = _Sum([float(p) for p in parts], count, missing, above, below)
+                    total.add_occurrences(occurrences)
                 case _:
                     raise ValueError(f"no saved sum: {name}")
         return means

@@ -5,13 +5,39 @@ from typing import Final
 
 import numpy as np
 
-from model.arrays import Floats
+from model.arrays import Bools, Floats
 from model.metrics import density, displacement, multimodal, offroad
-from model.mixture import TrajectoryMixture
+from model.mixture import TrajectoryMixture, merge_modes
 from model.scene import Raster
 
 SAMPLES: Final = 2000
 """Trajectories that the paper draws for ADE-f, FDE-f and OffR-f."""
+
+MERGED_SHARE: Final = 0.9
+"""Of the probability; ``merged_modes_90`` counts the merged modes that hold it."""
+MERGED_TOP_K: Final = (5, 10)
+"""Merged modes that count; the best of one is the likeliest, which has figures by horizon."""
+
+MOVING: Final = "moving_"
+"""Begins the names of figures without the agents that stood."""
+MOVING_FIGURES: Final = (
+    "ade_ml_6s_m",
+    "fde_ml_6s_m",
+    "off_road_ml",
+    "off_road_f",
+    "nll",
+    "inside_90",
+    *(f"inside_90_{h}s" for h in displacement.HORIZONS_S),
+    *(f"{name}_{k}{unit}" for name, unit in (("min_ade", "_m"), ("miss_rate", "")) for k in (5, 10)),
+    *(f"merged_{name}_{k}{unit}" for name, unit in (("min_ade", "_m"), ("miss_rate", "")) for k in (5, 10)),
+    "merged_min_fde_5_m",
+    "merged_brier_min_fde_5_m",
+    "merged_modes_90",
+    "merged_first_weight",
+    "ade_merged_6s_m",
+    "fde_merged_6s_m",
+)
+"""The figures that are told without the agents that stood, too."""
 
 _CHUNK_POINTS: Final = 1 << 18
 """Sampled positions looked at at once."""
@@ -26,6 +52,7 @@ def instance_metrics(
     samples: int = SAMPLES,
     draws: int = density.DRAWS,
     noise_m: float = density.LABEL_NOISE_M,
+    stood: Bools | None = None,
 ) -> dict[str, Floats]:
     """Metrics of N forecasts, each [N]; their means over instances are the figures of the tables.
 
@@ -33,6 +60,10 @@ def instance_metrics(
 
     - ``ade_ml_{h}s_m``, ``fde_ml_{h}s_m``: m, of the most likely trajectory.
     - ``min_ade_{k}_m``, ``min_fde_{k}_m``, ``miss_rate_{k}``: whole, as in nuscenes-devkit.
+    - of the merged modes (``model.mixture.merge_modes``): ``ade_merged_{h}s_m``, ``fde_merged_{h}s_m``: m, of
+      the likeliest; for k in 5, 10 ``merged_min_ade_{k}_m``, ``merged_min_fde_{k}_m``,
+      ``merged_miss_rate_{k}`` and ``merged_brier_min_fde_{k}_m``; ``merged_modes_90``: how many hold 90 % of
+      the probability; ``merged_first_weight``: of the likeliest. Everything else is of the modes as they are.
     - ``nll``: nats, mean over the steps; ``nll_{h}s``: at that step; ``nll_joint``: whole trajectory. Of the
       labelled position: the mixture is widened by ``noise_m`` (see ``density``).
     - with rasters: ``off_road_ml``: 1 or 0, the most likely trajectory; NaN without a map.
@@ -40,6 +71,7 @@ def instance_metrics(
       also ``off_road_f``, share of the samples.
     - with seeds and ``draws``: ``inside_{p}``: share of the steps at which the truth lies inside the p %
       highest-density region of the widened mixture; ``inside_{p}_{h}s``: 1 or 0, at that step.
+    - with ``stood``: ``moving_{figure}``, each of ``MOVING_FIGURES`` that is there, NaN for who stood.
 
     An instance with a step of the truth that is not finite gets NaN wherever that step counts.
 
@@ -53,6 +85,7 @@ def instance_metrics(
         draws: for calibration; 0 for none.
         noise_m: standard deviation of labelled positions, m, for likelihood and calibration; 0 for the plain
             mixture.
+        stood: [N], of ``standing.stood``; None for no figures without those.
 
     Raises:
         ValueError: sizes do not fit, or N is 0.
@@ -64,6 +97,8 @@ def instance_metrics(
         raise ValueError(f"truth of {count} forecasts of {steps} steps cannot be {truth.shape}")
     if seeds is not None and len(seeds) != count:
         raise ValueError(f"{count} instances need as many seeds, not {len(seeds)}")
+    if stood is not None and stood.shape != (count,):
+        raise ValueError(f"whether {count} agents stood cannot be {stood.shape}")
     mixture = TrajectoryMixture(
         mixture.log_weights.detach().cpu(),
         mixture.means.detach().cpu(),
@@ -78,6 +113,7 @@ def instance_metrics(
         result[f"min_ade_{k}_m"] = multimodal.min_ade_m(modes, probabilities, truth, k)
         result[f"min_fde_{k}_m"] = multimodal.min_fde_m(modes, probabilities, truth, k)
         result[f"miss_rate_{k}"] = multimodal.missed(modes, probabilities, truth, k)
+    result |= _merged(mixture, truth)
     result |= _likelihood(mixture, truth, noise_m)
     if rasters is not None:
         result["off_road_ml"] = offroad.off_road_of_each(rasters, most_likely)
@@ -85,6 +121,25 @@ def instance_metrics(
         result |= _sampled(mixture, truth, rasters, seeds, samples)
     if seeds is not None and draws:
         result |= _calibration(mixture, truth, seeds, draws, noise_m)
+    if stood is not None:
+        moving = {name: result[name] for name in MOVING_FIGURES if name in result}
+        result |= {f"{MOVING}{name}": np.where(stood, np.nan, values) for name, values in moving.items()}
+    return result
+
+
+def _merged(mixture: TrajectoryMixture, truth: Floats) -> dict[str, Floats]:
+    """Figures of the merged modes. Padding does no harm: it ranks last, and repeats a mode that is there."""
+    merged = merge_modes(mixture).mixture
+    likeliest = merged.most_likely_trajectory().numpy()
+    result = _by_horizon("merged", displacement.displacement_m(likeliest, truth))
+    modes, probabilities = merged.world_means.numpy(), merged.weights.double().numpy()
+    for k in MERGED_TOP_K:
+        result[f"merged_min_ade_{k}_m"] = multimodal.min_ade_m(modes, probabilities, truth, k)
+        result[f"merged_min_fde_{k}_m"] = multimodal.min_fde_m(modes, probabilities, truth, k)
+        result[f"merged_miss_rate_{k}"] = multimodal.missed(modes, probabilities, truth, k)
+        result[f"merged_brier_min_fde_{k}_m"] = multimodal.brier_min_fde_m(modes, probabilities, truth, k)
+    result["merged_modes_90"] = multimodal.modes_holding(probabilities, MERGED_SHARE)
+    result["merged_first_weight"] = probabilities.max(axis=1)
     return result
 
 

@@ -75,6 +75,35 @@ def missed(
     return best_of_top_k(misses, probabilities, k)
 
 
+def brier_min_fde_m(modes: Floats, probabilities: Floats, truth: Floats, k: int) -> Floats:
+    """brier-minFDE_k: minFDE_k and (1 − p)², p the probability of the mode that is nearest at the last step.
+
+    As Argoverse has it: it asks of the mode that comes true that it was held probable. Of modes equally near
+    the most probable counts.
+
+    Returns:
+        [N], m and a number from 0 to 1 added; NaN as in ``min_ade_m``. Arguments as there; probabilities sum
+        to 1 over all K modes, not over the k.
+    """
+    errors_m = _errors_m(modes, truth)[..., -1]
+    ranked = by_probability(probabilities)[:, :k]
+    nearest = np.take_along_axis(errors_m, ranked, axis=1).argmin(axis=1)[:, None]
+    chosen = np.take_along_axis(probabilities, np.take_along_axis(ranked, nearest, axis=1), axis=1)[:, 0]
+    return best_of_top_k(errors_m, probabilities, k) + (1 - chosen) ** 2
+
+
+def modes_holding(probabilities: Floats, share: float) -> Floats:
+    """Return how many modes, the most probable first, together hold a share of the probability: [N].
+
+    Args:
+        probabilities: [N, K], summing to 1; zero for modes that are padding.
+        share: in (0, 1].
+    """
+    held = np.cumsum(-np.sort(-probabilities, axis=1), axis=1)
+    short = held < share - 1e-6  # float32's weights sum to 1 up to that
+    return np.asarray(1.0 + short[:, :-1].sum(axis=1))
+
+
 def _errors_m(modes: Floats, truth: Floats) -> Floats:
     """[N, K, T], m."""
     return displacement_m(modes, truth[:, None])

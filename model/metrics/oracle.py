@@ -9,6 +9,7 @@ import torch
 
 from model.arrays import Floats, Ints
 from model.metrics.displacement import displacement_m
+from model.metrics.evaluate import MOVING
 from model.mixture import TrajectoryMixture
 
 ORACLE = "physics-oracle"
@@ -21,7 +22,8 @@ PHYSICS = (
 )
 """Names of the models that it chooses from, in the order that settles ties."""
 
-_OF_THE_LIKELIEST = ("ade_ml_", "fde_ml_", "off_road_ml")
+_LIKELIEST = ("ade_ml_", "fde_ml_", "off_road_ml")
+_OF_THE_LIKELIEST = (*_LIKELIEST, *(f"{MOVING}{name}" for name in _LIKELIEST))
 
 
 class Criterion(StrEnum):

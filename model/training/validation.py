@@ -7,16 +7,18 @@ from typing import Any
 import numpy as np
 import torch
 
-from model.arrays import Floats
+from model.arrays import Bools, Floats
 from model.data.batches import Batches
 from model.data.cache import Cache
 from model.forecaster import Context, Features
 from model.metrics.aggregate import MetricMeans
 from model.metrics.evaluate import instance_metrics
+from model.metrics.standing import stood
 from model.mixture import TrajectoryMixture
 from model.network_forecaster import Networks
 from model.networks.config import AnyNetworkConfig
 from model.scene import AgentType, Raster
+from model.standardization import state_scale
 
 BATCH = 512
 
@@ -31,6 +33,8 @@ class JudgedBatch:
     """[N, 12, 2], m, ground frame."""
     rasters: Sequence[Raster]
     """N; pairs of a scene share one."""
+    stood: Bools
+    """[N], whether the agent stood before now (``model.metrics.standing``)."""
     seeds: Sequence[int]
     """N, the pairs' numbers in the split: what is drawn for a pair does not hang on its batch."""
 
@@ -43,7 +47,9 @@ class JudgedBatch:
             draws: for calibration; 0 leaves it out.
         """
         seeds = self.seeds if samples or draws else None
-        return instance_metrics(mixture, self.truth, self.rasters, seeds, samples=samples, draws=draws)
+        return instance_metrics(
+            mixture, self.truth, self.rasters, seeds, samples=samples, draws=draws, stood=self.stood
+        )
 
 
 class Validation:
@@ -58,6 +64,7 @@ class Validation:
     def __init__(self, cache: Cache, config: AnyNetworkConfig | None, device: torch.device) -> None:
         self._cache = cache
         self._batches = Batches(cache, device, config)
+        self._stood = _stood(cache)
 
     def __call__(self, networks: Networks[Any]) -> dict[str, float]:
         """The figures that need no samples, quick enough for after each epoch."""
@@ -83,7 +90,7 @@ class Validation:
             log_weights, positions = network(features, Context.FULL, batch.truth.shape[1])
             mixture = TrajectoryMixture(log_weights, positions.mean, positions.covariance, features["origin"])
             means.add(batch.metrics(mixture, samples, draws))
-        return {name: value for name, value in means.means().items() if np.isfinite(value)}
+        return {name: value for name, value in means.figures().items() if np.isfinite(value)}
 
     def batches(self, limit: int | None = None) -> Iterator[JudgedBatch]:
         """The pairs in order, some at a time; only the maps of those are in memory.
@@ -98,4 +105,18 @@ class Validation:
             truth = (future.double() + features["origin"][:, None]).cpu().numpy()
             scenes = self._cache.scene[indices.numpy()].tolist()
             rasters = {scene: self._cache.raster(scene) for scene in set(scenes)}
-            yield JudgedBatch(features, truth, [rasters[scene] for scene in scenes], indices.tolist())
+            yield JudgedBatch(
+                features,
+                truth,
+                [rasters[scene] for scene in scenes],
+                self._stood[indices.numpy()],
+                indices.tolist(),
+            )
+
+
+def _stood(cache: Cache) -> Bools:
+    """Return which pairs' agents stood before now: [P]."""
+    scale = state_scale(AgentType.VEHICLE, AgentType.VEHICLE)[:2]
+    history = np.array(cache.history[..., :2]) * scale  # Relative to now, however it is turned
+    seen = np.arange(history.shape[1]) >= cache.first[:, None]
+    return stood(np.where(seen[..., None], history, np.nan))

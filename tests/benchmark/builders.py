@@ -11,6 +11,7 @@ from benchmark.models import BASELINES
 from benchmark.results import Latency, ModelResult, Results
 from model.forecaster import Protocol
 from model.metrics.convergence import RANGES_M
+from model.metrics.evaluate import MOVING, MOVING_FIGURES
 from model.scene import Raster
 
 NAMES = (
@@ -55,6 +56,13 @@ def made_metrics(scale: float = 1.0) -> dict[str, float]:
     for k in (1, 5, 10):
         figures |= {f"min_ade_{k}_m": 3.0 * scale / k, f"min_fde_{k}_m": 8.0 * scale / k}
         figures[f"miss_rate_{k}"] = 1 / k
+    for k in (5, 10):
+        figures |= {f"merged_min_ade_{k}_m": 2.0 * scale / k, f"merged_min_fde_{k}_m": 6.0 * scale / k}
+        figures |= {f"merged_miss_rate_{k}": 0.5 / k, f"merged_brier_min_fde_{k}_m": 0.25 + 6.0 * scale / k}
+    figures |= {"merged_modes_90": 3.25, "merged_modes_90_median": 3.0, "merged_first_weight": 0.625}
+    figures |= {"ade_merged_6s_m": 2.75 * scale, "fde_merged_6s_m": 7.0 * scale}
+    figures |= {f"{MOVING}{name}": 1.01 * figures[name] for name in MOVING_FIGURES if name in figures}
+    figures["moving_merged_modes_90_median"] = 4.0
     figures |= {"dispersion_std_m": 2.0 * scale, "dispersion_mean_m": 3.0 * scale}
     figures["dispersion_rms_m"] = math.hypot(2.0, 3.0) * scale
     figures |= {f"convergence_{range_m:g}m_s": math.sqrt(range_m) / scale for range_m in RANGES_M}

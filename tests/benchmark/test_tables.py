@@ -28,7 +28,10 @@ def test_every_table_says_what_it_is_of() -> None:
     results = replace(made_results(*all_models()), limit=10)
     made = tables(results)
     assert [table.title[:3].strip(" .") for table in made] == [
-        *"123456",
+        *"1234",
+        "4.1",
+        "4.2",
+        *"56",
         "7.1",
         "7.2",
         "7.3",
@@ -55,8 +58,17 @@ def test_figures_stand_in_their_columns() -> None:
     assert [second[name] for name in ("C(0.2 m)", "C(1 m)", "C(5 m)")] == ["0.45", "1.00", "2.24"]
     assert second["instants"] == "30"
     assert titled(made, "3. Hard").rows == (("cab@1.0.0", "15.00", "14.00", "13.00", "7.20"),)
-    modes = cells(titled(made, "Modes"))
+    modes = cells(titled(made, "Raw modes"))
     assert (modes["minADE_5"], modes["minFDE_10"], modes["miss rate 5"]) == ("0.60", "0.80", "0.20")
+    assert titled(made, "Merged modes").rows == (
+        (
+            "cab@1.0.0",
+            *("0.40", "0.20", "1.20", "0.60", "0.10", "0.05", "1.45", "3.00", "3.25", "0.62", "2.75", "7.00"),
+        ),
+    )
+    moving = cells(titled(made, "Without those that stood"))
+    assert (moving["FDE"], moving["minADE_5, raw"], moving["minADE_5, merged"]) == ("7.27", "0.61", "0.40")
+    assert (moving["OffR-f"], moving["hold 90 %, median"]) == ("0.25", "4.00")
     likely = cells(titled(made, "Likelihood"))
     assert (likely["NLL"], likely["NLL 3 s"], likely["inside 90 %"]) == ("1.500", "1.500", "0.841")
 
@@ -132,7 +144,7 @@ def test_what_the_paper_has_not_is_a_dash() -> None:
 def test_a_table_with_nothing_to_say_is_left_out_and_says_why() -> None:
     model = made_model("kalman", metrics=without("dispersion", "convergence", "hardest"))
     results = replace(made_results(replace(model, instants=0, latency=None, statuses={})), consistency=False)
-    assert [table.title[0] for table in tables(results)] == ["1", "4", "5"]
+    assert [table.title[0] for table in tables(results)] == ["1", "4", "4", "4", "5"]
     reasons = left_out(results)
     assert len(reasons) == 7
     assert "2. Dispersion and convergence: left out: dispersion and convergence were not asked for" in reasons

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +63,23 @@ def test_batches_make_no_difference(
     for name, one in whole.items():
         for metric, value in one.metrics.means().items():
             assert cut[name].metrics.mean(metric) == pytest.approx(value, rel=1e-4, abs=1e-4), metric
+
+
+def test_a_cache_tells_who_stood_as_the_scene_does(tmp_path: Path, models: tuple[Learned, ...]) -> None:
+    scene = record()
+    first = scene.tracks[0]
+    still = first.position.copy()
+    still[:8] = still[7]
+    scene = replace(scene, tracks=[replace(first, position=still), *scene.tracks[1:]])
+    expected = scene.stood(scene.pairs)
+    assert [pair.frame for pair, stood in zip(scene.pairs, expected, strict=True) if stood] == [4, 5, 6, 7]
+    ((found, _),) = open_validations(
+        models, tmp_path, FixedReader(scene), "made", "some", Protocol.CAUSAL, lambda said: None
+    )
+    np.testing.assert_array_equal(np.concatenate([batch.stood for batch in found.batches()]), expected)
+    means = judge_learned(found, models, ablate=False, samples=0, draws=0)["cab@1.0.0"].metrics
+    assert means.count("moving_fde_ml_6s_m") == means.count("fde_ml_6s_m") - 4
+    assert means.figures()["merged_modes_90_median"] in (1, 1.5, 2, 2.5, 3)
 
 
 def test_ablation_judges_what_a_model_looks_at(tmp_path: Path, models: tuple[Learned, ...]) -> None:

@@ -68,6 +68,26 @@ def test_infinities_are_not_hidden() -> None:
     assert MetricMeans.from_state(json.loads(state)).mean("m") == math.inf
 
 
+@settings(deadline=None)
+@given(st.lists(st.integers(1, 9) | st.none(), max_size=30), st.integers(0, 1000))
+def test_medians_of_counts_are_exact_however_the_batches_are_cut(counts: list[int | None], seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    values = rng.permutation(np.array([np.nan if count is None else count for count in counts], dtype=float))
+    one, other = MetricMeans(), MetricMeans()
+    for batch in np.array_split(values, 3):
+        one.add({"merged_modes_90": batch, "nll": batch})
+    other.add({"merged_modes_90": values})
+    restored = MetricMeans.from_state(json.loads(json.dumps(one.state())))
+    known = values[~np.isnan(values)]
+    expected = float(np.median(known)) if len(known) else math.nan
+    np.testing.assert_equal(one.medians(), {"merged_modes_90_median": expected})
+    np.testing.assert_equal(other.medians(), one.medians())
+    np.testing.assert_equal(restored.medians(), one.medians())
+    np.testing.assert_equal(one.figures(), one.means() | one.medians())
+    one.merge(other)
+    np.testing.assert_equal(one.medians(), restored.medians())
+
+
 @pytest.mark.parametrize("state", [{"m": {}}, {"m": {"parts": 1, "count": 1, "missing": 0}}])
 def test_a_state_of_another_form_is_refused(state: dict[str, dict[str, list[float] | int]]) -> None:
     with pytest.raises(ValueError, match="m"):

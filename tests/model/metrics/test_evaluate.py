@@ -4,17 +4,22 @@ import torch
 
 from model.arrays import Floats
 from model.metrics import density, displacement, multimodal, offroad
-from model.metrics.evaluate import instance_metrics
-from model.mixture import TrajectoryMixture
+from model.metrics.evaluate import MOVING, MOVING_FIGURES, instance_metrics
+from model.mixture import TrajectoryMixture, merge_modes
 from tests.model.metrics.builders import certain, random_mixture, raster
 
 SEEDS = [11, 12, 13]
 ROAD = raster(np.ones((50, 50), dtype=np.uint8), 0.1, (-250.0, -250.0))
 HORIZONS = range(1, 7)
 ALWAYS = {
-    *(f"{name}_ml_{h}s_m" for name in ("ade", "fde") for h in HORIZONS),
+    *(f"{name}_{of}_{h}s_m" for name in ("ade", "fde") for of in ("ml", "merged") for h in HORIZONS),
     *(name.format(k) for name in ("min_ade_{}_m", "min_fde_{}_m", "miss_rate_{}") for k in (1, 5, 10)),
     *(f"nll_{h}s" for h in HORIZONS),
+    *(f"merged_{name}_{k}_m" for name in ("min_ade", "min_fde", "brier_min_fde") for k in (5, 10)),
+    "merged_miss_rate_5",
+    "merged_miss_rate_10",
+    "merged_modes_90",
+    "merged_first_weight",
     "nll",
     "nll_joint",
 }
@@ -86,7 +91,7 @@ def test_a_certain_forecast_that_is_right() -> None:
     m = certain(random_mixture(3, modes=1))
     got = instance_metrics(m, m.most_likely_trajectory().numpy(), [ROAD] * 3, SEEDS, samples=7)
     for name, values in got.items():
-        if name.startswith("inside"):
+        if name.startswith("inside") or name in ("merged_modes_90", "merged_first_weight"):
             assert (values == 1).all(), name
         elif not name.startswith("nll"):
             np.testing.assert_allclose(values, 0, atol=1e-12, err_msg=name)
@@ -121,6 +126,52 @@ def test_a_mode_of_no_weight_does_no_harm() -> None:
     got = instance_metrics(m, _truth(m), [ROAD] * 3, SEEDS, samples=5)
     for name, values in got.items():
         assert np.isfinite(values).all(), name
+
+
+def test_merged_figures_are_those_of_each_agents_own_merged_modes() -> None:
+    """However many merged modes the others in the batch have."""
+    m = random_mixture(8, agents=12, modes=9)
+    # From six bundles to one
+    m = TrajectoryMixture(m.log_weights, m.means / torch.arange(1, 13)[:, None, None, None], *_rest(m))
+    truth = _truth(m)
+    got = instance_metrics(m, truth)
+    merged = merge_modes(m)
+    assert len(set(merged.counts.tolist())) > 2
+    for agent, count in enumerate(merged.counts.tolist()):
+        modes = merged.mixture.world_means[agent, :count].numpy()[None]
+        weights = merged.mixture.weights[agent, :count].numpy()[None]
+        here = truth[agent : agent + 1]
+        for k in (5, 10):
+            for name, figure in (
+                (f"merged_min_ade_{k}_m", multimodal.min_ade_m),
+                (f"merged_min_fde_{k}_m", multimodal.min_fde_m),
+                (f"merged_miss_rate_{k}", multimodal.missed),
+                (f"merged_brier_min_fde_{k}_m", multimodal.brier_min_fde_m),
+            ):
+                np.testing.assert_allclose(got[name][agent], figure(modes, weights, here, k), err_msg=name)
+        assert got["merged_modes_90"][agent] == multimodal.modes_holding(weights, 0.9)
+        assert got["merged_first_weight"][agent] == weights.max()
+        likeliest = displacement.displacement_m(modes[0, weights[0].argmax()], here[0])
+        np.testing.assert_allclose(got["fde_merged_6s_m"][agent], likeliest[-1])
+        np.testing.assert_allclose(got["ade_merged_3s_m"][agent], likeliest[:6].mean())
+
+
+def _rest(m: TrajectoryMixture) -> tuple[torch.Tensor, torch.Tensor]:
+    return m.covariances, m.origin
+
+
+def test_figures_without_those_that_stood() -> None:
+    m = random_mixture(9)
+    truth = _truth(m)
+    plain = instance_metrics(m, truth, [ROAD] * 3, SEEDS, samples=5)
+    got = instance_metrics(m, truth, [ROAD] * 3, SEEDS, samples=5, stood=np.array([False, True, False]))
+    assert set(got) - set(plain) == {f"{MOVING}{name}" for name in MOVING_FIGURES}
+    for name in MOVING_FIGURES:
+        np.testing.assert_array_equal(got[f"{MOVING}{name}"], np.where([0, 1, 0], np.nan, plain[name]), name)
+    few = instance_metrics(m, truth, stood=np.zeros(3, dtype=np.bool_))
+    assert "moving_off_road_f" not in few
+    with pytest.raises(ValueError, match="stood"):
+        instance_metrics(m, truth, stood=np.zeros(2, dtype=np.bool_))
 
 
 def test_sizes_must_fit() -> None:

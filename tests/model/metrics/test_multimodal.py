@@ -21,6 +21,25 @@ def test_by_hand() -> None:
         assert multimodal.missed(MODES, PROBABILITIES, TRUTH, k).tolist() == [miss]
 
 
+def test_brier_by_hand() -> None:
+    """The nearest of the first at the end has 0.5, of more 0.3."""
+    for k, expected in ((1, 1 + 0.25), (2, 0.49), (3, 0.49), (10, 0.49)):
+        found = multimodal.brier_min_fde_m(MODES, PROBABILITIES, TRUTH, k)
+        np.testing.assert_allclose(found, [expected])
+
+
+def test_of_modes_that_end_equally_near_the_most_probable_counts() -> None:
+    found = multimodal.brier_min_fde_m(MODES[:, [0, 0, 0]], PROBABILITIES, TRUTH, 3)
+    np.testing.assert_allclose(found, [1 + 0.25])
+
+
+def test_how_many_modes_hold_a_share() -> None:
+    weights = np.array([[0.5, 0.3, 0.15, 0.05], [0.05, 0.9, 0.05, 0.0], [0.4, 0.25, 0.25, 0.1], [0, 1, 0, 0]])
+    assert multimodal.modes_holding(weights, 0.9).tolist() == [3, 1, 3, 1]
+    assert multimodal.modes_holding(weights, 1.0).tolist() == [4, 3, 4, 1]
+    assert multimodal.modes_holding(weights[:, :1] * 0 + 1, 0.9).tolist() == [1, 1, 1, 1]
+
+
 def test_the_tolerance_itself_is_a_miss() -> None:
     only = MODES[:, 2:]
     assert multimodal.missed(only, np.ones((1, 1)), TRUTH, 1).tolist() == [1]
