@@ -49,6 +49,7 @@ class SceneRequests:
         return predict_request(
             time=call.frame * STEP_SECONDS,
             agents=agents,
+            merge=False,  # The challenge ranks the model's own modes, and the judge merges by itself
             raster=crop(self._scene.record.raster, around),
         )
 

@@ -30,9 +30,9 @@ TypeName = Literal["vehicle", "pedestrian", "cyclist", "unknown"]
 History = Literal["request", "memory"]
 
 PATCH_PIXELS = 100
-"""Rows and columns of an agent's own map patch."""
+"""Rows and columns of an agent's own map patches, the near and the far one."""
 PIXELS_PER_METER = 3.0
-"""Resolution of a patch; a raster of the same loses nothing when the server cuts patches from it."""
+"""Resolution of a near patch; a raster of the same loses nothing when the server cuts patches from it."""
 
 _Floats = npt.NDArray[np.float64]
 
@@ -49,6 +49,7 @@ def agent(
     heading_rates: npt.ArrayLike | None = None,
     predict: bool = True,
     patch: MapPatch | None = None,
+    far_map_patch: MapPatch | None = None,
 ) -> Agent:
     """An agent and its history, F observations, oldest first.
 
@@ -65,6 +66,7 @@ def agent(
         heading_rates: [F], rad/s.
         predict: False makes it a neighbour for the others, without a forecast of its own.
         patch: its own map, see ``map_patch``; goes before the scene's raster.
+        far_map_patch: its own map of what lies farther, likewise; only models that look so far read it.
 
     Raises:
         ValueError: an unknown type, or arrays whose shapes do not fit each other.
@@ -88,7 +90,14 @@ def agent(
         AgentState(**{k: v for k, v in zip(columns, row, strict=True) if k in required or not math.isnan(v)})
         for row in zip(*(column.tolist() for column in columns.values()), strict=True)
     ]
-    return Agent(id=agent_id, type=_type_number(agent_type), states=states, predict=predict, map_patch=patch)
+    return Agent(
+        id=agent_id,
+        type=_type_number(agent_type),
+        states=states,
+        predict=predict,
+        map_patch=patch,
+        far_map_patch=far_map_patch,
+    )
 
 
 def scene_raster(
@@ -122,11 +131,12 @@ def scene_raster(
 
 
 def map_patch(layers: npt.ArrayLike, encoding: ImageEncoding = "packed_bits") -> MapPatch:
-    """The map in one agent's frame.
+    """The map in one agent's frame, near or far.
 
     Args:
         layers: [3, 100, 100], binary: driveable area, road dividers, lane dividers. Element [layer, i, j]
-            shows the point (i − 10)/3 m ahead of the agent and (j − 50)/3 m to its left.
+            shows the point (i − 10)/3 m ahead of the agent and (j − 50)/3 m to its left; of a far patch the
+            point (i − 14)/1.4 m ahead and (j − 50)/1.4 m to the left.
         encoding: as in ``scene_raster``.
 
     Raises:
@@ -146,6 +156,7 @@ def predict_request(
     model: str = "",
     raster: SceneRaster | None = None,
     max_modes: int = 0,
+    merge: bool = True,
     samples: int = 0,
     seed: int | None = None,
     horizon: float | None = None,
@@ -164,6 +175,8 @@ def predict_request(
         model: ``name`` or ``name@version``; empty: the server's default.
         raster: see ``scene_raster``.
         max_modes: return so many of the likeliest modes only; 0: all.
+        merge: return modes that a planner would not tell apart as one, their weights summed; False: all modes
+            as the model has them.
         samples: trajectories to draw for each agent.
         seed: of the samples; None: the server draws one and returns it.
         horizon: s, a multiple of 0.5; None: the model's.
@@ -186,6 +199,7 @@ def predict_request(
         scene_raster=raster,
         options=PredictOptions(
             max_modes=max_modes,
+            merge=merge,
             samples=samples,
             seed=seed,
             horizon=horizon,

@@ -59,5 +59,6 @@ class Crowd:
             scene_id=self._id(number) if self._tracked else "",
             model=MODEL,
             max_modes=1,
+            merge=False,
         )
         self._store.client.predict(request)

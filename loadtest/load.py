@@ -58,7 +58,7 @@ class SteadyLoad:
 
     async def _call(self, scene: int, now: float, traffic: Traffic) -> None:
         request = predict_request(
-            now, traffic.agents(now, _STATES), scene_id=f"scene-{scene}", model=self.model
+            now, traffic.agents(now, _STATES), scene_id=f"scene-{scene}", model=self.model, merge=False
         )
         sent, told, failure = time.perf_counter(), Tracking.UNSPECIFIED, ""
         try:

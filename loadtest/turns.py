@@ -5,6 +5,7 @@ import random
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -122,12 +123,11 @@ class Turns:
         now = START + STEP * self._frame
         self._frame += 1
         whole, newest = self._traffic.agents(now, STATES), self._traffic.agents(now, 1)
+        ask = partial(predict_request, now, model=self._model, merge=False)
         return {
-            "untracked": predict_request(now, whole, model=self._model),
-            "tracked": predict_request(now, whole, model=self._model, scene_id=self._scene_id("tracked")),
-            "recalled": predict_request(
-                now, newest, model=self._model, scene_id=self._scene_id("recalled"), history="memory"
-            ),
+            "untracked": ask(whole),
+            "tracked": ask(whole, scene_id=self._scene_id("tracked")),
+            "recalled": ask(newest, scene_id=self._scene_id("recalled"), history="memory"),
         }
 
 

@@ -156,7 +156,8 @@ def merge_modes(
     The heaviest mode is kept, and those near it join it; of the rest the heaviest is kept, and so on (of
     equal weights the lower number first). A mode is near a kept one if at every step their means are at
     most max(min_distance_m, relative_distance · d) apart, d the distance of the kept mode's mean from the
-    origin, where the agent is now, at that step: two ways around an obstacle stay two though they end at one place.
+    origin, where the agent is now, at that step: two ways around an obstacle stay two though they end at
+    one place.
 
     The members' weights add up. The kept mode's means stand for the group, because a weighted mean of
     paths need not be one that can be driven; a group's covariance is its members' second moment about
@@ -240,6 +241,8 @@ def _leaders(means: Tensor, alive: Tensor, min_distance_m: float, relative_dista
     # A step at a time and agents last: what is at work stays in the cache, and loops run over many agents
     x, y = means.permute(3, 2, 1, 0).contiguous()  # [T, K, N] each
     allowed = (relative_distance * torch.hypot(x, y)).clamp_min(min_distance_m).square()
+    # What overflows is near nothing, or covariances would overflow, too
+    allowed.clamp_(max=torch.finfo(allowed.dtype).max)
     near = torch.ones(x.shape[1], *x.shape[1:], dtype=torch.bool, device=x.device)
     for east, north, most in zip(x, y, allowed, strict=True):
         squared = (east[:, None] - east).square_()  # [K, K, N]

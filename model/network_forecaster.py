@@ -1,6 +1,7 @@
 """What forecasters around trained networks share."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -83,8 +84,7 @@ class NetworkForecaster(Forecaster, Generic[SomeNetworks]):
         require_observed(states, targets)
         if self.requires_heading(agent_type) and np.isnan(states.heading[targets, -1]).any():
             raise ValueError("an agent to be forecast has no heading")
-        scene = Scene(scene.types, states, scene.raster, scene.patches)
-        return network_features(scene, targets, agent_type, self.config, context)
+        return network_features(replace(scene, states=states), targets, agent_type, self.config, context)
 
     @torch.inference_mode()
     def forecast(

@@ -96,6 +96,10 @@ class Scene:
     raster: Raster | None = None
     patches: dict[int, Bytes | Float32s] = field(default_factory=dict)
     """Agents' own map patches by agent index, each [3, 100, 100] in [0, 1]; they go before the raster."""
+    far_patches: dict[int, Bytes | Float32s] = field(default_factory=dict)
+    """The same of what lies farther, each [3, 100, 100] in [0, 1], 1.4 pixels per metre: element
+    [layer, i, j] shows the point (i − 14)/1.4 m ahead and (j − 50)/1.4 m to the left. They, too, go before
+    the raster."""
 
     def of_type(self, kind: AgentType) -> Bools:
         """[N], which agents are of that type."""

@@ -37,6 +37,9 @@ def predict(
     max_modes: Annotated[
         int | None, typer.Option(min=0, max=_MOST, help="Return the likeliest modes only; 0: all.")
     ] = None,
+    all_modes: Annotated[
+        bool, typer.Option("--all-modes", help="As the model has them: like ones are not merged.")
+    ] = False,
     blind: Annotated[bool, typer.Option("--blind", help="Without map and neighbours.")] = False,
     strict: Annotated[bool, typer.Option("--strict", help="Fail if any agent cannot be forecast.")] = False,
     plot: Annotated[
@@ -62,6 +65,7 @@ def predict(
         seed=seed,
         horizon=horizon,
         max_modes=max_modes,
+        merge=not all_modes,
         blind=blind,
         strict=strict,
     )

@@ -25,6 +25,8 @@ class Changes:
     seed: int | None
     horizon: float | None
     max_modes: int | None
+    merge: bool
+    """Always said: what a person reads is merged, unless all modes are asked for."""
     blind: bool
     strict: bool
 
@@ -36,6 +38,7 @@ class Changes:
             value = getattr(self, name)
             if value is not None:
                 setattr(request.options, name, value)
+        request.options.merge = self.merge
         if self.blind:
             request.options.context = CONTEXT_BLIND
         if self.strict:

@@ -7,8 +7,9 @@ double is a tag byte and eight bytes.
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 from google.protobuf.descriptor import FieldDescriptor
@@ -26,7 +27,10 @@ from service.limits import too_long
 from service.settings import Settings
 
 PATCH_PIXELS = 100
-"""Rows and columns of an agent's own map patch."""
+"""Rows and columns of an agent's own map patches, the near and the far one."""
+
+_PatchName = Literal["map_patch", "far_map_patch"]
+_PATCH_NAMES: tuple[_PatchName, ...] = get_args(_PatchName)
 
 TYPES = {
     models_pb.AGENT_TYPE_VEHICLE: AgentType.VEHICLE,
@@ -67,6 +71,8 @@ class Agents:
     """Of the valid ones; None when there are none."""
     patches: dict[int, Bytes | Float32s]
     """Own map patches by index among the valid ones, each [3, 100, 100]."""
+    far_patches: dict[int, Bytes | Float32s]
+    """Own far map patches, likewise."""
 
 
 def read_agents(request: pb.PredictRequest, settings: Settings) -> Agents:
@@ -89,15 +95,14 @@ def read_agents(request: pb.PredictRequest, settings: Settings) -> Agents:
     table.find_faults()
     faults |= table.faults
 
-    images: dict[int, Bytes] = {}
+    images: dict[_PatchName, dict[int, Bytes]] = {name: {} for name in _PATCH_NAMES}
     for index in whole:
-        if index in faults or not agents[index].HasField("map_patch"):
+        if index in faults:
             continue
-        field = f"agents[{index}].map_patch.image"
         try:
-            images[index] = decode_layers(
-                agents[index].map_patch.image, field, PATCH_PIXELS, PATCH_PIXELS, PATCH_PIXELS**2
-            )
+            for name in _PATCH_NAMES:
+                if agents[index].HasField(name):
+                    images[name][index] = _read_patch(agents[index], name, f"agents[{index}]")
         except BadField as error:
             faults[index] = error.faults[0]
 
@@ -109,8 +114,24 @@ def read_agents(request: pb.PredictRequest, settings: Settings) -> Agents:
         valid=np.array(valid, dtype=np.int64),
         types=[TYPES[agents[index].type] for index in valid],
         observations=table.observations(faults) if valid else None,
-        patches={row: images[index] for row, index in enumerate(valid) if index in images},
+        patches=_by_row(images["map_patch"], valid),
+        far_patches=_by_row(images["far_map_patch"], valid),
     )
+
+
+def _read_patch(agent: pb.Agent, name: _PatchName, here: str) -> Bytes:
+    """Return one of an agent's own map patches: [3, 100, 100].
+
+    Raises:
+        BadField: it is no such patch.
+    """
+    image: pb.LayerImage = getattr(agent, name).image
+    return decode_layers(image, f"{here}.{name}.image", PATCH_PIXELS, PATCH_PIXELS, PATCH_PIXELS**2)
+
+
+def _by_row(images: Mapping[int, Bytes], valid: Sequence[int]) -> dict[int, Bytes | Float32s]:
+    """Return the images of valid agents by their index among those."""
+    return {row: images[index] for row, index in enumerate(valid) if index in images}
 
 
 def _head_faults(request: pb.PredictRequest, ids: Sequence[str], settings: Settings) -> dict[int, Fault]:

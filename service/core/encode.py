@@ -9,10 +9,11 @@ import torch
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.arrays import Bools, Floats, Ints
-from model.mixture import TrajectoryMixture
+from model.mixture import TrajectoryMixture, merge_modes
 from model.scene import STEP_SECONDS
 from service.core.batcher import Outcome
 from service.core.catalog import reference
+from service.core.options import Options
 from service.core.plan import Draft, Plan
 
 
@@ -27,8 +28,10 @@ class Result:
 
 @dataclass(frozen=True)
 class _Numbers:
-    """A result's numbers as the answer wants them, float64; M of the K modes."""
+    """A result's numbers as the answer wants them, float64; at most M of the K modes."""
 
+    counts: Ints
+    """[N], how many of the M are the agent's; what stands behind them is to be left out."""
     mode_ids: Ints
     """[N, M], ascending."""
     weights: Floats
@@ -36,9 +39,9 @@ class _Numbers:
     remaining: Floats
     """[N]."""
     means: Floats
-    """[N, M · T · 2]."""
+    """[N, M, T · 2]."""
     covariances: Floats
-    """[N, M · T · 3]."""
+    """[N, M, T · 3]."""
     samples: Floats
     """[N, S · T · 2]."""
 
@@ -94,7 +97,7 @@ def encode(
     places: dict[int, tuple[_Numbers, int]] = {}
     for result in results:
         seeds = [agent_seed(seed, draft.agent_id) for draft in result.drafts]
-        numbers = _numbers(result.mixture, options.max_modes, options.samples, seeds)
+        numbers = _numbers(result.mixture, options, seeds)
         for row, draft in enumerate(result.drafts):
             places[draft.index] = numbers, row
     for draft in plan.drafts:
@@ -108,42 +111,53 @@ def encode(
     return response
 
 
-def _numbers(mixture: TrajectoryMixture, max_modes: int, samples: int, seeds: Sequence[int]) -> _Numbers:
+def _numbers(mixture: TrajectoryMixture, options: Options, seeds: Sequence[int]) -> _Numbers:
+    agents, modes = mixture.log_weights.shape
+    counts: Ints = np.full(agents, modes)
+    mode_ids: Ints = np.broadcast_to(np.arange(modes), (agents, modes))
     with torch.inference_mode():
+        drawn: Floats = (
+            mixture.sample(options.samples, seeds).numpy() if options.samples else np.zeros((agents, 0))
+        )
+        if options.merge:
+            merged = merge_modes(mixture)
+            mixture, counts, mode_ids = merged.mixture, merged.counts.numpy(), merged.mode_ids.numpy()
+            modes = mode_ids.shape[1]
         weights: Floats = mixture.log_weights.double().softmax(dim=1).numpy()
         means: Floats = mixture.world_means.numpy()
         covariances: Floats = mixture.covariances.double().numpy()
-        drawn: Floats = mixture.sample(samples, seeds).numpy() if samples else np.zeros((len(mixture), 0))
-    agents, modes = weights.shape
-    mode_ids = np.broadcast_to(np.arange(modes), weights.shape)
     remaining = np.zeros(agents)
-    if 0 < max_modes < modes:
-        heaviest = np.argsort(-weights, axis=1, kind="stable")[:, :max_modes]
-        mode_ids = np.sort(heaviest, axis=1)
+    if 0 < options.max_modes < modes:
+        heaviest = np.argsort(-weights, axis=1, kind="stable")[:, : options.max_modes]
+        places = np.sort(heaviest, axis=1)
         rows = np.arange(agents)[:, None]
-        weights, means, covariances = (
-            weights[rows, mode_ids],
-            means[rows, mode_ids],
-            covariances[rows, mode_ids],
+        counts = np.minimum(counts, options.max_modes)
+        weights, means, covariances, mode_ids = (
+            weights[rows, places],
+            means[rows, places],
+            covariances[rows, places],
+            mode_ids[rows, places],
         )
         remaining = np.clip(1.0 - weights.sum(axis=1), 0.0, 1.0)
     triangle = covariances[..., [0, 0, 1], [0, 1, 1]]
     return _Numbers(
+        counts=counts,
         mode_ids=mode_ids,
         weights=weights,
         remaining=remaining,
-        means=means.reshape(agents, -1),
-        covariances=triangle.reshape(agents, -1),
+        means=means.reshape(*mode_ids.shape, -1),
+        covariances=triangle.reshape(*mode_ids.shape, -1),
         samples=drawn.reshape(agents, -1),
     )
 
 
 def _fill(forecast: pb.AgentForecast, numbers: _Numbers, row: int) -> None:
     # Lists, because protobuf takes a list of floats several times faster than an array
-    forecast.mode_ids.extend(numbers.mode_ids[row].tolist())
-    forecast.weights.extend(numbers.weights[row].tolist())
+    count = int(numbers.counts[row])
+    forecast.mode_ids.extend(numbers.mode_ids[row, :count].tolist())
+    forecast.weights.extend(numbers.weights[row, :count].tolist())
     forecast.remaining_weight = float(numbers.remaining[row])
-    forecast.most_likely_mode = int(numbers.weights[row].argmax())
-    forecast.means.extend(numbers.means[row].tolist())
-    forecast.covariances.extend(numbers.covariances[row].tolist())
+    forecast.most_likely_mode = int(numbers.weights[row, :count].argmax())
+    forecast.means.extend(numbers.means[row, :count].ravel().tolist())
+    forecast.covariances.extend(numbers.covariances[row, :count].ravel().tolist())
     forecast.samples.extend(numbers.samples[row].tolist())

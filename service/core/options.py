@@ -40,6 +40,8 @@ class Options:
     context: Context
     max_modes: int
     """0: all."""
+    merge: bool
+    """Whether modes that a planner would not tell apart are returned as one."""
     samples: int
     seed: int | None
     strict: bool
@@ -98,6 +100,7 @@ def read_options(request: pb.PredictRequest, info: ModelInfo, settings: Settings
         steps=_steps(options, info),
         context=context,
         max_modes=options.max_modes,
+        merge=options.merge,
         samples=options.samples,
         seed=options.seed if options.HasField("seed") else None,
         strict=options.strict,

@@ -1,13 +1,13 @@
 """Who forecasts which agent of a call, and from what."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
-from model.arrays import Bytes, Float32s, Ints
+from model.arrays import Ints
 from model.forecaster import Context, Forecaster, Protocol
 from model.resample import MAX_AGE, MAX_GAP, MIN_DIFFERENCE_SPAN, resample
 from model.scene import AgentType, Raster, Scene
@@ -89,8 +89,7 @@ class Plan:
             raise ValueError("an invalid agent cannot be forecast")
         info = forecaster.info
         context = self.options.context if info.supports_blind else Context.FULL
-        states = scene.states.last_frames(info.history_frames)
-        seen = Scene(types=scene.types, states=states, raster=scene.raster, patches=scene.patches)
+        seen = replace(scene, states=scene.states.last_frames(info.history_frames))
         targets = np.array([draft.row for draft in drafts], dtype=np.int64)
         with torch.inference_mode():
             features = forecaster.prepare(seen, targets, context)
@@ -189,11 +188,12 @@ def _build_scene(
     if not kept.any():
         return None, {}, faults
     new_row = np.cumsum(kept) - 1
-    patches: dict[int, Bytes | Float32s] = {
-        int(new_row[row]): patch for row, patch in agents.patches.items() if kept[row]
-    }
+    patches, far_patches = (
+        {int(new_row[row]): patch for row, patch in given.items() if kept[row]}
+        for given in (agents.patches, agents.far_patches)
+    )
     types = [kind for kind, keep in zip(agents.types, kept.tolist(), strict=True) if keep]
-    scene = Scene(types=types, states=states.select(kept), raster=raster, patches=patches)
+    scene = Scene(types, states.select(kept), raster, patches, far_patches)
     indices: Ints = agents.valid[kept]
     return scene, {int(index): row for row, index in enumerate(indices)}, faults
 

@@ -125,6 +125,10 @@ def test_rasters_and_patches() -> None:
     assert len(map_patch(np.zeros((3, 100, 100))).image.packed_bits) == 3750
     with pytest.raises(ValueError, match=r"\[3, 100, 100\]"):
         map_patch(np.zeros((3, 100, 99)))
+    near, far = map_patch(np.zeros((3, 100, 100))), map_patch(np.ones((3, 100, 100)))
+    both = agent("a", "vehicle", [0.0], [[1.0, 2.0]], patch=near, far_map_patch=far)
+    assert (both.map_patch, both.far_map_patch) == (near, far)
+    assert not agent("a", "vehicle", [0.0], [[1.0, 2.0]], patch=near).HasField("far_map_patch")
 
 
 def test_options() -> None:
@@ -136,12 +140,14 @@ def test_options() -> None:
     assert not plain.options.HasField("horizon")
     assert plain.options.history == HISTORY_SOURCE_UNSPECIFIED  # servers that do not know of it understand
     assert not plain.options.consistency
+    assert plain.options.merge
     full = predict_request(
         1.0,
         [],
         scene_id="s",
         model="m@1",
         max_modes=2,
+        merge=False,
         samples=3,
         seed=0,
         horizon=1.5,
@@ -158,6 +164,7 @@ def test_options() -> None:
     assert options.strict
     assert options.history == HISTORY_SOURCE_MEMORY
     assert options.consistency
+    assert not options.merge
     with pytest.raises(ValueError, match="request, memory, not 'both'"):
         predict_request(1.0, [], history="both")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="range"):

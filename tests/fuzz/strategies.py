@@ -71,6 +71,8 @@ def agents(draw: st.DrawFn, now: float, index: int) -> pb.Agent:
         agent.predict = draw(st.booleans())
     if draw(st.sampled_from([False, False, False, True])):
         agent.map_patch.image.CopyFrom(draw(images(100, 100)))
+    if draw(st.sampled_from([False, False, False, True])):
+        agent.far_map_patch.image.CopyFrom(draw(images(100, 100)))
     return agent
 
 
@@ -96,6 +98,7 @@ def options(draw: st.DrawFn) -> pb.PredictOptions:
         samples=draw(st.sampled_from([0, 0, 1, 20])),
         context=draw(st.sampled_from([0, 1, 2])),  # type: ignore[arg-type]
         strict=draw(st.sampled_from([False, False, True])),
+        merge=draw(st.booleans()),
     )
     if draw(st.booleans()):
         result.seed = draw(st.integers(0, 2**32 - 1))

@@ -24,12 +24,12 @@ def predict_examples() -> dict[str, dict[str, Any]]:
             "value": {"time": _NOW, "agents": [car]},
         },
         "street": {
-            "summary": "A car and a pedestrian beside a parked car; the three most likely modes, 3 s ahead",
+            "summary": "A car and a pedestrian beside a parked car; at most three modes, merged, 3 s ahead",
             "value": {
                 "scene_id": IDS["scene_id"],
                 "time": _NOW,
                 "agents": [car, walker, parked],
-                "options": {"max_modes": 3, "horizon": 3.0},
+                "options": {"merge": True, "max_modes": 3, "horizon": 3.0},
             },
         },
         "samples": {

@@ -58,6 +58,16 @@ def test_the_request_is_left_alone_otherwise(script: Script) -> None:
     assert script.predicted == [demo_request()]
 
 
+def test_modes_are_merged_unless_all_are_asked_for(script: Script) -> None:
+    for merge in (False, True):
+        request = demo_request()
+        request.options.merge = merge
+        content = request.SerializeToString()
+        assert run(app, ["predict", "-"], input=content).exit_code == 0
+        assert run(app, ["predict", "-", "--all-modes"], input=content).exit_code == 0
+    assert [request.options.merge for request in script.predicted] == [True, False, True, False]
+
+
 @pytest.mark.parametrize("name", ["request.json", "request.binpb"])
 def test_a_saved_request_can_be_sent(script: Script, tmp_path: Path, name: str) -> None:
     path = tmp_path / name

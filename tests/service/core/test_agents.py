@@ -234,25 +234,40 @@ def test_patches() -> None:
     request.agents[0].states[0].x = NAN
     request.agents[1].map_patch.image.packed_bits = pack(layers)
     request.agents[3].map_patch.image.png = png(layers)
+    request.agents[2].far_map_patch.image.png = png(layers)
+    request.agents[3].far_map_patch.image.packed_bits = pack(layers)
     agents = read_agents(request, SETTINGS)
     assert sorted(agents.patches) == [0, 2]  # among the valid ones
-    assert all(np.array_equal(patch, layers) for patch in agents.patches.values())
+    assert sorted(agents.far_patches) == [1, 2]
+    for patches in (agents.patches, agents.far_patches):
+        assert all(np.array_equal(patch, layers) for patch in patches.values())
 
 
+@pytest.mark.parametrize("name", ["map_patch", "far_map_patch"])
 @pytest.mark.parametrize(
     ("change", "field"),
     [
-        (lambda agent: agent.map_patch.SetInParent(), "image"),
-        (lambda agent: setattr(agent.map_patch.image, "packed_bits", b"123"), "image.packed_bits"),
-        (lambda agent: setattr(agent.map_patch.image, "png", b"123"), "image.png"),
+        (lambda patch: patch.SetInParent(), "image"),
+        (lambda patch: setattr(patch.image, "packed_bits", b"123"), "image.packed_bits"),
+        (lambda patch: setattr(patch.image, "png", b"123"), "image.png"),
         (
-            lambda agent: setattr(agent.map_patch.image, "png", png(np.zeros((3, 100, 99), dtype=np.uint8))),
+            lambda patch: setattr(patch.image, "png", png(np.zeros((3, 100, 99), dtype=np.uint8))),
             "image.png",
         ),
     ],
 )
-def test_a_bad_patch_costs_its_agent_only(change: Change, field: str) -> None:
-    assert fault(change).field == f"agents[1].map_patch.{field}"
+def test_a_bad_patch_costs_its_agent_only(
+    change: Callable[[pb.MapPatch], None], field: str, name: str
+) -> None:
+    assert fault(lambda agent: change(getattr(agent, name))).field == f"agents[1].{name}.{field}"
+
+
+def test_of_two_bad_patches_the_first_is_told() -> None:
+    def spoil(agent: pb.Agent) -> None:
+        agent.far_map_patch.image.packed_bits = b"123"
+        agent.map_patch.image.packed_bits = b"123"
+
+    assert fault(spoil).field == "agents[1].map_patch.image.packed_bits"
 
 
 def test_speed() -> None:

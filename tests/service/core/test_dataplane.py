@@ -92,6 +92,54 @@ async def test_more_modes_than_there_are(most: int) -> None:
     assert forecast.remaining_weight == 0
 
 
+async def test_merged_modes() -> None:
+    """At 6 s the heaviest mode is at 39 m, the others at 36, 33 and 30: within 7.8 m are the first two."""
+    async with opened(FakeForecaster()) as plane:
+        response = await plane.predict(make_request(2, merge=True, samples=4, seed=3))
+        plain = await plane.predict(make_request(2, samples=4, seed=3))
+    weights = np.exp([1, 2, 3, 4]) / np.exp([1, 2, 3, 4]).sum()
+    for forecast, unmerged in zip(response.forecasts, plain.forecasts, strict=True):
+        assert list(forecast.mode_ids) == [0, 3]
+        assert list(forecast.weights) == pytest.approx([weights[0], weights[1:].sum()])
+        assert (forecast.most_likely_mode, forecast.remaining_weight) == (1, 0)
+        assert means(forecast, response).tolist() == means(unmerged, plain)[[0, 3]].tolist()
+        own, merged = np.array(forecast.covariances).reshape(2, 12, 3)[:, -1]
+        assert own.tolist() == [6.0, 0.0, 6.0]
+        spread = (weights[1:] * np.array([6.0, 3.0, 0.0]) ** 2).sum() / weights[1:].sum()
+        assert merged.tolist() == pytest.approx([6.0 + spread, 0.0, 6.0], abs=1e-4)
+        assert list(forecast.samples) == list(unmerged.samples)
+
+
+async def test_of_merged_modes_the_likeliest_are_returned() -> None:
+    response = await predict(make_request(1, merge=True, max_modes=1), FakeForecaster())
+    [forecast] = response.forecasts
+    assert list(forecast.mode_ids) == [3]
+    assert means(forecast, response).shape == (1, 12, 2)
+    assert forecast.weights[0] + forecast.remaining_weight == pytest.approx(1)
+    assert forecast.remaining_weight > 0.01
+    [all_of_them] = (await predict(make_request(1, merge=True, max_modes=2), FakeForecaster())).forecasts
+    assert (list(all_of_them.mode_ids), all_of_them.remaining_weight) == ([0, 3], 0)
+
+
+async def test_agents_have_as_many_merged_modes_as_they_differ() -> None:
+    """In one batch: of a slow agent all modes are near each other; a fallback has one."""
+    request = make_request(1, merge=True)
+    add_agent(request, "slow", y=9.0, speed=1.0)
+    add_agent(request, "bike", CYCLIST, y=20.0)
+    for most in (0, 1, 2, 3):
+        request.options.max_modes = most
+        response = await predict(request, FakeForecaster())
+        fast, slow, bike = response.forecasts
+        assert bike.status == FALLBACK
+        assert list(fast.mode_ids) == ([3] if most == 1 else [0, 3])
+        assert [list(one.mode_ids) for one in (slow, bike)] == [[3], [0]]
+        for forecast in (slow, bike):
+            assert list(forecast.weights) == pytest.approx([1])
+            assert (forecast.most_likely_mode, forecast.remaining_weight) == (0, pytest.approx(0, abs=1e-6))
+            assert means(forecast, response).shape == (1, 12, 2)
+            assert len(forecast.covariances) == 36
+
+
 @pytest.mark.parametrize("horizon", [0.5, 3.0, 6.0])
 async def test_horizon(horizon: float) -> None:
     response = await predict(make_request(1, horizon=horizon), FakeForecaster())
@@ -236,11 +284,15 @@ async def test_map_reaches_the_model() -> None:
     request = make_request(3)
     request.agents[0].states[0].x = float("nan")
     request.agents[2].map_patch.image.packed_bits = pack(layers)
+    request.agents[1].far_map_patch.image.packed_bits = pack(1 - layers)
     without = await predict(request, fake)
     assert without.warnings == [
         "fake uses the map, but none was given for 1 of 2 agents: it saw an unknown one"
     ]
+    assert list(fake.scenes[-1].patches) == [1]
     assert np.array_equal(fake.scenes[-1].patches[1], layers)  # the second of the usable agents
+    assert list(fake.scenes[-1].far_patches) == [0]
+    assert np.array_equal(fake.scenes[-1].far_patches[0], 1 - layers)
     raster = request.scene_raster
     raster.rows = raster.columns = 100
     raster.origin_x, raster.origin_y, raster.pixels_per_meter = -3.0, 7.0, 2.0

@@ -159,6 +159,7 @@ class Agent(_message.Message):
     STATES_FIELD_NUMBER: _builtins.int
     PREDICT_FIELD_NUMBER: _builtins.int
     MAP_PATCH_FIELD_NUMBER: _builtins.int
+    FAR_MAP_PATCH_FIELD_NUMBER: _builtins.int
     id: _builtins.str
     """Unique within the request, 1 to 128 characters."""
     type: _model_service_pb2.AgentType.ValueType
@@ -182,6 +183,14 @@ class Agent(_message.Message):
     def map_patch(self) -> Global___MapPatch:
         """This agent's own view of the map. Optional."""
 
+    @_builtins.property
+    def far_map_patch(self) -> Global___MapPatch:
+        """The map around this agent about as far as it gets in 6 s: 100 × 100 pixels, 1.4 pixels per metre. Row i,
+        column j shows the point (i − 14)/1.4 m ahead of the agent and (j − 50)/1.4 m to its left. Optional; it
+        goes before the scene raster. Models that do not look so far leave it unread. Without it and without a
+        scene raster a model that does sees an unknown far map, even where map_patch is given.
+        """
+
     def __init__(
         self,
         *,
@@ -190,10 +199,11 @@ class Agent(_message.Message):
         states: _abc.Iterable[Global___AgentState] | None = ...,
         predict: _builtins.bool | None = ...,
         map_patch: Global___MapPatch | None = ...,
+        far_map_patch: Global___MapPatch | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["_predict", b"_predict", "map_patch", b"map_patch", "predict", b"predict"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["_predict", b"_predict", "far_map_patch", b"far_map_patch", "map_patch", b"map_patch", "predict", b"predict"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_predict", b"_predict", "id", b"id", "map_patch", b"map_patch", "predict", b"predict", "states", b"states", "type", b"type"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_predict", b"_predict", "far_map_patch", b"far_map_patch", "id", b"id", "map_patch", b"map_patch", "predict", b"predict", "states", b"states", "type", b"type"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__predict: _TypeAlias = _typing.Literal["predict"]  # noqa: Y015
     _WhichOneofArgType__predict: _TypeAlias = _typing.Literal["_predict", b"_predict"]  # noqa: Y015
@@ -321,8 +331,8 @@ Global___LayerImage: _TypeAlias = LayerImage  # noqa: Y015
 
 @_typing.final
 class MapPatch(_message.Message):
-    """The map in one agent's frame: 100 × 100 pixels, 3 pixels per metre. Row i, column j shows the point
-    (i − 10)/3 m ahead of the agent and (j − 50)/3 m to its left.
+    """The map in one agent's frame: 100 × 100 pixels. As map_patch it has 3 pixels per metre: row i, column j
+    shows the point (i − 10)/3 m ahead of the agent and (j − 50)/3 m to its left. As far_map_patch it has 1.4.
     """
 
     DESCRIPTOR: _descriptor.Descriptor
@@ -347,7 +357,7 @@ Global___MapPatch: _TypeAlias = MapPatch  # noqa: Y015
 class SceneRaster(_message.Message):
     """The map of the whole scene. Row i, column j shows the ground point
     (origin_x + i / pixels_per_meter, origin_y + j / pixels_per_meter): rows run along x, columns along y.
-    Beyond its edges nothing is driveable.
+    Beyond its edges nothing is known to models in the agent's frame; older models take it for not driveable.
     """
 
     DESCRIPTOR: _descriptor.Descriptor
@@ -411,9 +421,10 @@ class PredictOptions(_message.Message):
     STRICT_FIELD_NUMBER: _builtins.int
     HISTORY_FIELD_NUMBER: _builtins.int
     CONSISTENCY_FIELD_NUMBER: _builtins.int
+    MERGE_FIELD_NUMBER: _builtins.int
     max_modes: _builtins.int
     """Return the most likely modes only, at most this many; remaining_weight is what the rest weigh.
-    0 returns all.
+    0 returns all. With merge it counts merged modes.
     """
     samples: _builtins.int
     """Trajectories to draw from the mixture for each agent; at most 2000, and 100,000 over a call, by default."""
@@ -429,6 +440,14 @@ class PredictOptions(_message.Message):
     history: Global___HistorySource.ValueType
     consistency: _builtins.bool
     """True: give each forecast the latest consistency of its agent. Needs a scene_id."""
+    merge: _builtins.bool
+    """True: merge modes that a planner would not tell apart. The most probable mode is kept, and each mode
+    joins it whose mean is, at every step returned, at most max(2 m, 0.2 · d) from the kept one's, d being
+    how far the kept one is then from where the agent is now; of the rest the most probable is kept, and so
+    on (of equal ones the lower number). Weights add up; the kept mode's means, which can be driven, stand
+    for its group; covariances are the group's second moment about those means. mode_ids are the kept modes'
+    numbers. Samples are drawn, and forecasts remembered, as without it. Default false: all modes.
+    """
     def __init__(
         self,
         *,
@@ -440,10 +459,11 @@ class PredictOptions(_message.Message):
         strict: _builtins.bool = ...,
         history: Global___HistorySource.ValueType = ...,
         consistency: _builtins.bool = ...,
+        merge: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["_horizon", b"_horizon", "_seed", b"_seed", "horizon", b"horizon", "seed", b"seed"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_horizon", b"_horizon", "_seed", b"_seed", "consistency", b"consistency", "context", b"context", "history", b"history", "horizon", b"horizon", "max_modes", b"max_modes", "samples", b"samples", "seed", b"seed", "strict", b"strict"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_horizon", b"_horizon", "_seed", b"_seed", "consistency", b"consistency", "context", b"context", "history", b"history", "horizon", b"horizon", "max_modes", b"max_modes", "merge", b"merge", "samples", b"samples", "seed", b"seed", "strict", b"strict"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__horizon: _TypeAlias = _typing.Literal["horizon"]  # noqa: Y015
     _WhichOneofArgType__horizon: _TypeAlias = _typing.Literal["_horizon", b"_horizon"]  # noqa: Y015
@@ -499,7 +519,9 @@ class AgentForecast(_message.Message):
 
     @_builtins.property
     def mode_ids(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
-        """Number of the model's mode for each of the K modes returned."""
+        """Number of the model's mode for each of the K modes returned, ascending; of a merged mode that of the one
+        that was kept.
+        """
 
     @_builtins.property
     def weights(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
