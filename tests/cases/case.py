@@ -25,7 +25,7 @@ PIXELS_PER_METER = 3.0
 Road = Callable[[Floats, Floats], Bools]
 """Layers [3, ...] (driveable area, road dividers, lane dividers) at the points x, y [...], m, of a scene."""
 View = Literal["raster", "patch", "none"]
-"""How a request shows the map: one raster of the scene, the car's own patch, or not at all."""
+"""How a request shows the map: one raster of the scene, the car's own patches, or not at all."""
 
 
 class Row(StrEnum):
@@ -177,8 +177,9 @@ class Scenario:
         if self.lead is not None:
             cars.append(_agent("lead", self.lead, scene))
         if self.road is not None and view == "patch":
-            cars[0].map_patch.CopyFrom(map_patch(self._patch(self.road)))
-        request = predict_request(NOW, cars)
+            cars[0].map_patch.CopyFrom(map_patch(self._patch(self.road, 3.0, 10)))
+            cars[0].far_map_patch.CopyFrom(map_patch(self._patch(self.road, 1.4, 14)))
+        request = predict_request(NOW, cars, merge=False)
         if raster is not None:
             request.scene_raster.CopyFrom(
                 scene_raster(raster.layers, tuple(raster.origin), raster.pixels_per_meter)
@@ -199,9 +200,9 @@ class Scenario:
         low, high = self.extent or (tuple(ends.min(0)), tuple(ends.max(0)))
         return _paint(road, self.pose, low, high)
 
-    def _patch(self, road: Road) -> Bools:
-        """Return the car's own patch, painted anew in its own frame."""
-        ahead, left = (np.arange(100) - 10) / 3, (np.arange(100) - 50) / 3
+    def _patch(self, road: Road, pixels_per_meter: float, behind: int) -> Bools:
+        """Return a patch of the car's own, painted anew in its own frame, with so many rows behind it."""
+        ahead, left = (np.arange(100) - behind) / pixels_per_meter, (np.arange(100) - 50) / pixels_per_meter
         points = np.stack(np.meshgrid(ahead, left, indexing="ij"), axis=-1)
         if self.pose.mirrored:
             points = points * (1.0, -1.0)
