@@ -25,7 +25,7 @@ PIXELS_PER_METER = 3.0
 Road = Callable[[Floats, Floats], Bools]
 """Layers [3, ...] (driveable area, road dividers, lane dividers) at the points x, y [...], m, of a scene."""
 View = Literal["raster", "patch", "none"]
-"""How a request shows the map: one raster of the scene, the car's own patch, or not at all."""
+"""How a request shows the map: one raster of the scene, the car's own patches, or not at all."""
 
 
 class Row(StrEnum):
@@ -172,17 +172,17 @@ class Scenario:
         frame = Frame(
             scene.to_ground(self.position), self.pose.angle + sign * self.heading, self.pose.mirrored
         )
-        raster = None if self.road is None or view != "raster" else self._raster(self.road)
         cars = [_agent(CAR, self.car, scene)]
         if self.lead is not None:
             cars.append(_agent("lead", self.lead, scene))
         if self.road is not None and view == "patch":
-            cars[0].map_patch.CopyFrom(map_patch(self._patch(self.road)))
-        request = predict_request(NOW, cars)
-        if raster is not None:
-            request.scene_raster.CopyFrom(
-                scene_raster(raster.layers, tuple(raster.origin), raster.pixels_per_meter)
-            )
+            cars[0].map_patch.CopyFrom(map_patch(self._patch(self.road, 3.0, 10)))
+            cars[0].far_map_patch.CopyFrom(map_patch(self._patch(self.road, 1.4, 14)))
+        request = predict_request(NOW, cars, merge=False)
+        raster = None
+        if self.road is not None and view == "raster":
+            raster, sent = self._raster(self.road)
+            request.scene_raster.CopyFrom(sent)
         return Case(self.name, self.row, request, frame, self.facts, raster, self._lead_ahead())
 
     def _lead_ahead(self) -> Frame | None:
@@ -192,16 +192,17 @@ class Scenario:
         car = Frame(self.position, self.heading)
         return Frame(car.to_local(self.lead.positions[-1]), float(self.lead.headings[-1]) - self.heading)
 
-    def _raster(self, road: Road) -> Raster:
-        """Return the road as a raster that reaches 85 m beyond all places where the car may be in 6 s."""
+    def _raster(self, road: Road) -> tuple[Raster, pb.SceneRaster]:
+        """Return the road as a raster that reaches 85 m beyond all places where the car may be in 6 s, as the
+        judge has it and as it is sent."""
         ahead = rotate(np.array([6.0 * max(self.facts.speed, 0.0) + 40.0, 0.0]), np.array(self.heading))
         ends = np.stack([self.position, self.position + ahead])
         low, high = self.extent or (tuple(ends.min(0)), tuple(ends.max(0)))
         return _paint(road, self.pose, low, high)
 
-    def _patch(self, road: Road) -> Bools:
-        """Return the car's own patch, painted anew in its own frame."""
-        ahead, left = (np.arange(100) - 10) / 3, (np.arange(100) - 50) / 3
+    def _patch(self, road: Road, pixels_per_meter: float, behind: int) -> Bools:
+        """Return a patch of the car's own, painted anew in its own frame, with so many rows behind it."""
+        ahead, left = (np.arange(100) - behind) / pixels_per_meter, (np.arange(100) - 50) / pixels_per_meter
         points = np.stack(np.meshgrid(ahead, left, indexing="ij"), axis=-1)
         if self.pose.mirrored:
             points = points * (1.0, -1.0)
@@ -223,8 +224,10 @@ def _agent(name: str, track: Track, scene: Frame) -> pb.Agent:
 
 
 @lru_cache(maxsize=4)  # successive scenes of one drive share theirs
-def _paint(road: Road, pose: Pose, low: tuple[float, float], high: tuple[float, float]) -> Raster:
-    """Return the raster of a road that reaches beyond an extent in the scene's frame."""
+def _paint(
+    road: Road, pose: Pose, low: tuple[float, float], high: tuple[float, float]
+) -> tuple[Raster, pb.SceneRaster]:
+    """Return the raster of a road that reaches beyond an extent in the scene's frame, and its message."""
     (left, bottom), (right, top) = low, high
     corners = [(x, y) for x in (left - MARGIN, right + MARGIN) for y in (bottom - MARGIN, top + MARGIN)]
     scene = pose.frame()
@@ -233,4 +236,8 @@ def _paint(road: Road, pose: Pose, low: tuple[float, float], high: tuple[float, 
     rows, columns = np.ceil((on_ground.max(0) - origin) * PIXELS_PER_METER).astype(int)
     pixels = np.stack(np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"), axis=-1)
     local = scene.to_local(origin + pixels / PIXELS_PER_METER)
-    return Raster(road(local[..., 0], local[..., 1]).astype(np.uint8), origin, PIXELS_PER_METER)
+    layers = road(local[..., 0], local[..., 1])
+    return (
+        Raster(layers.astype(np.uint8), origin, PIXELS_PER_METER),
+        scene_raster(layers, tuple(origin), PIXELS_PER_METER),
+    )

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from tests.cases import checks, driving, scenes
@@ -86,7 +86,8 @@ def test_a_turned_and_shifted_scene_has_the_turned_forecasts(served: Served, vie
     if frame != "agent":
         pytest.skip(f"{served.info.full_name} sees the {frame} frame, not the agent's")
 
-    @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+    # A failure is not shrunk: every example takes a forward, and any angle tells as much as another
+    @settings(max_examples=12, deadline=None, phases=[Phase.explicit, Phase.reuse, Phase.generate])
     @given(
         scenario=st.sampled_from(list(SCENARIOS.values())),
         angle=st.floats(-math.pi, math.pi),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from cab_forecast import Status
+from cab_forecast.layers import decode_layers
 from model.arrays import Floats
 from model.physics import baselines
 from tests.cases import checks, roads, scenes
@@ -92,16 +93,16 @@ def test_who_keeps_the_lane_stays_on_the_road(name: str, mirrored: bool) -> None
     )
 
 
-def test_a_patch_shows_what_the_raster_does() -> None:
+@pytest.mark.parametrize(("field", "scale", "behind"), [("map_patch", 3.0, 10), ("far_map_patch", 1.4, 14)])
+def test_patches_show_the_road_around_the_car(field: str, scale: float, behind: int) -> None:
     road = roads.junction(2, 3.6, 5.0)
     scenario = SCENARIOS["junction in 22 m"]
-    near = np.unpackbits(
-        np.frombuffer(scenario.case("patch").request.agents[0].map_patch.image.packed_bits, np.uint8),
-        count=30000,
-    ).reshape(3, 100, 100)
-    for ahead, left in ((0, 0), (15, -10), (22, 3), (29, 12), (-3, -16)):
-        x, y = scenario.position + np.array([ahead, left])
-        np.testing.assert_array_equal(near[:, 10 + 3 * ahead, 50 + 3 * left], road(x, y))
+    car = scenario.at(Pose(40.0, -7.0, 1.2)).case("patch").request.agents[0]
+    shown = decode_layers(getattr(car, field).image, 100, 100)
+    for row, column in ((0, 50), (behind, 50), (20, 30), (40, 60), (70, 85), (99, 3)):
+        x, y = scenario.position + np.array([row - behind, column - 50]) / scale
+        np.testing.assert_array_equal(shown[:, row, column], road(x, y))
+    assert not shown[0].all()
 
 
 def test_shares_are_those_of_the_weights() -> None:
