@@ -1,9 +1,11 @@
 """From a scene to the tensors that a network of the agent's frame takes."""
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
 
-from model.arrays import Bools, Float32s, Floats, Ints
+from model.arrays import Bools, Bytes, Float32s, Floats, Ints
 from model.forecaster import Context, Features
 from model.geometry import rotate, wrap_angle
 from model.networks.config import NetworkConfig
@@ -21,8 +23,8 @@ NEIGHBOR_POSITION_SCALE = 30.0
 NEIGHBOR_VELOCITY_SCALE = 15.0
 NEIGHBOR_ACCELERATION_SCALE = 4.0
 NEIGHBOR_FEATURES = 11
-"""Numbers that tell a neighbour: x, y, cosine and sine of its heading (zeros where unknown), vx, vy, ax, ay, all
-in the agent's frame, whether it is a vehicle, whether it is a pedestrian, and 1 (0 where there is none)."""
+"""Numbers that tell a neighbour: x, y, cosine and sine of its heading (zeros where unknown), vx, vy, ax, ay,
+all in the agent's frame, whether it is a vehicle, whether it is a pedestrian, and 1 (0 where nobody is)."""
 
 
 def agent_frame_features(scene: Scene, targets: Ints, config: NetworkConfig, context: Context) -> Features:
@@ -70,7 +72,8 @@ def _histories(states: AgentStates, targets: Ints) -> Floats:
         wrap_angle(states.heading[targets] - heading)[..., None],
         states.heading_rate[targets][..., None],
     ]
-    return np.nan_to_num(np.concatenate(parts, axis=-1) / HISTORY_SCALE, nan=0.0)
+    histories: Floats = np.nan_to_num(np.concatenate(parts, axis=-1) / HISTORY_SCALE, nan=0.0)
+    return histories
 
 
 def _neighbors(scene: Scene, targets: Ints, types: tuple[AgentType, ...]) -> Floats:
@@ -115,7 +118,9 @@ def _neighbors(scene: Scene, targets: Ints, types: tuple[AgentType, ...]) -> Flo
 _KINDS = (AgentType.VEHICLE, AgentType.PEDESTRIAN)
 
 
-def _maps(scene: Scene, targets: Ints, patches: dict[int, Float32s], geometry: PatchGeometry) -> Float32s:
+def _maps(
+    scene: Scene, targets: Ints, patches: Mapping[int, Bytes | Float32s], geometry: PatchGeometry
+) -> Float32s:
     """Return maps of n agents: [n, 3, S, S]: absent −1, present 1; 0 where nothing is known, as outside the
     raster."""
     maps = np.zeros((len(targets), 3, geometry.size, geometry.size), dtype=np.float32)

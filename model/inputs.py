@@ -17,8 +17,10 @@ def network_features(
     """Features of n agents of one type.
 
     Returns:
-        ``model.features.scene_features``, or in the agent's frame ``model.agent_features``; for CoverNet without neighbours' histories, but with
-        ``surroundings`` [n, S, 5] float32 (``model.surroundings``), if it draws any and with full context.
+        Those of ``model.features.scene_features``; for a network of the agent's frame those of
+        ``model.agent_features.agent_frame_features``; for CoverNet the former without neighbours' histories,
+        but with ``surroundings`` [n, S, 5] float32 (``model.surroundings``) where it draws any and the
+        context is full.
     """
     if isinstance(config, NetworkConfig) and config.frame is Frame.AGENT:
         return agent_frame_features(scene, targets, config, context)

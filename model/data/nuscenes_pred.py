@@ -7,6 +7,7 @@
 It holds the vehicles of the challenge around their windows only: no pedestrians, parked cars or ego.
 """
 
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,8 +19,12 @@ from model.data.checks import check_pairs
 from model.data.scenes import DataError, Pair, SceneRecord, Track
 from model.scene import AgentType, Raster
 
-_FOLDERS = {"train": "train", "train_val": "val"}
+_FOLDERS = {"train": "train", "train_main": "train", "train_fold": "train", "train_val": "val"}
 """The challenge's train_val is the folder val: AgentFormer evaluates on what the challenge validates on."""
+_FOLD_PARTS = 10
+"""One scene of so many of train is in ``train_fold``, the others are in ``train_main``: recipes and epochs
+are chosen on the fold, so that figures on train_val are of data that chose nothing."""
+_IN_FOLD = {"train_main": False, "train_fold": True}
 _CLASSES = frozenset({"Car", "Bus", "Truck", "Emergency", "Construction"})
 _COLUMNS = 18
 _FRAME, _AGENT, _CLASS, _X, _Y, _YAW, _ASKED = 0, 1, 2, 13, 15, 16, 17
@@ -45,7 +50,7 @@ class NuscenesPredReader:
 
     @property
     def splits(self) -> tuple[str, ...]:
-        """Splits of the prediction challenge."""
+        """Splits of the prediction challenge, and train in two parts by scenes."""
         return tuple(_FOLDERS)
 
     def scenes(self, split: str) -> Iterator[SceneRecord]:
@@ -61,6 +66,8 @@ class NuscenesPredReader:
         if not files:
             raise DataError(f"{folder}: there are no label files (*.txt)")
         for file in files:
+            if split in _IN_FOLD and _IN_FOLD[split] is not _in_fold(file.stem):
+                continue
             record = self._scene(file)
             if record.pairs:
                 yield record
@@ -71,6 +78,11 @@ class NuscenesPredReader:
         maps = self._folder / "map_0.1"
         raster = _read_raster(maps / f"{file.stem}.png", maps / f"meta_{file.stem}.txt")
         return SceneRecord(file.stem, tracks, pairs, raster)
+
+
+def _in_fold(scene: str) -> bool:
+    """Whether a scene of train is in the fold; it hangs on its name alone."""
+    return zlib.crc32(scene.encode()) % _FOLD_PARTS == 0
 
 
 def _read_labels(file: Path) -> tuple[list[Track], list[Pair]]:

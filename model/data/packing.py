@@ -5,7 +5,6 @@ pixel outside finds zeros there without being told where the raster ends.
 """
 
 import numpy as np
-
 import torch
 from torch import Tensor
 
@@ -43,10 +42,9 @@ def pack_patches(patches: Float32s) -> Bytes:
         patches: [N, 3, S, S] in [0, 1]; ½ in all layers where nothing is known.
     """
     level = np.round(patches * (_LEVELS - 1)).astype(np.uint8)
-    packed = level[:, 0] | level[:, 1] << 2 | level[:, 2] << 4
+    packed: Bytes = level[:, 0] | np.left_shift(level[:, 1], 2) | np.left_shift(level[:, 2], 4)
     packed[(np.abs(patches - 0.5) < 1e-3).all(axis=1)] = UNKNOWN
-    result: Bytes = packed
-    return result
+    return packed
 
 
 def _table() -> Tensor:

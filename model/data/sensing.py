@@ -1,15 +1,16 @@
 """Recorded tracks as a tracker might have reported them: the inputs that training varies.
 
-Recorded scenes have clean poses at 2 Hz. A service gets observations at any rate, with noise, with and without
-headings and velocities, with gaps, of agents first seen a moment ago. Here such observations are drawn from
-recorded tracks, and brought onto the grid by ``model.resample``, as the server does.
+Recorded scenes have clean poses at 2 Hz. A service gets observations at any rate, with noise, with and
+without headings and velocities, with gaps, of agents first seen a moment ago. Here such observations are
+drawn from recorded tracks, and brought onto the grid by ``model.resample``, as the server does.
 
 Between recorded poses an agent moves along a cubic Hermite spline. Its tangent now comes from the past alone
 (a parabola through the last three poses): a tangent from both sides would put the next position into the
 observations (REFERENCE: what the papers' inputs leak).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
@@ -199,10 +200,9 @@ def _headings(headings: Floats, ages: Floats) -> Floats:
 def _where(chosen: Bools, some: AgentStates, others: AgentStates) -> AgentStates:
     """Return states of each agent [N] from the first where it is chosen, else from the second."""
 
-    def pick(name: str) -> Floats:
-        one, another = getattr(some, name), getattr(others, name)
-        picked: Floats = np.where(chosen.reshape(-1, *[1] * (one.ndim - 1)), one, another)
-        return picked
+    def pick(one: Any, another: Any) -> Any:
+        return np.where(chosen.reshape(-1, *[1] * (one.ndim - 1)), one, another)
 
-    names = ("position", "velocity", "acceleration", "heading", "heading_rate", "first", "velocity_known")
-    return AgentStates(**{name: pick(name) for name in names})
+    return AgentStates(
+        **{part.name: pick(getattr(some, part.name), getattr(others, part.name)) for part in fields(some)}
+    )

@@ -38,6 +38,17 @@ def parse_data(text: str) -> tuple[str, Path]:
     return kind, Path(path)
 
 
+def parse_also(text: str) -> tuple[str, Path, str]:
+    """KIND, PATH and SPLIT of KIND:PATH@SPLIT; without one the split is ``train``.
+
+    Raises:
+        DataError: it is no such thing, or the kind is unknown.
+    """
+    place, at, split = text.rpartition("@")
+    kind, path = parse_data(place if at else text)
+    return kind, path, split if at else "train"
+
+
 def parse_protocol(name: str) -> Protocol:
     """A protocol by its name.
 

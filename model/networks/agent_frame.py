@@ -19,12 +19,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from model.raster import FAR, NEAR, PatchGeometry
 from model.agent_features import NEIGHBOR_FEATURES
 from model.forecaster import Context, Features
 from model.networks.config import NetworkConfig
 from model.networks.dynamics import Positions
 from model.networks.recurrent import HistoryLSTM
+from model.raster import FAR, NEAR, PatchGeometry
 from model.scene import STEP_SECONDS, AgentType
 from model.standardization import STATE_SIZE
 
@@ -162,6 +162,10 @@ class AgentFrameNetwork(nn.Module):
     no neighbours, which is also what a call without map and neighbours gives it.
     """
 
+    usual_log_sigma: Tensor
+    """[T, 2], of standard deviations along and across a path, where the decoder begins."""
+    variance_floor: Tensor
+    """[T], m²."""
     width: Tensor
     """[T], factor on the standard deviations, fitted after training."""
     temperature: Tensor
@@ -271,9 +275,10 @@ class AgentFrameNetwork(nn.Module):
         return F.log_softmax(modes.logits / self.temperature, dim=-1), Positions(mean, covariance)
 
     def _read(self, path: Path, features: Features, context: Context) -> Tensor:
-        """Return what is met at every other step of each mode, encoded: [N, K, T/2, 32]. No gradient reaches the path.
+        """Return what is met at every other step of each mode, encoded: [N, K, T/2, 32].
 
-        The parts go through slices of one linear layer, as joining them would copy more than it computes.
+        No gradient reaches the path. Each part has a linear layer of its own: to join them first would copy
+        more than it computes.
         """
         x, y, heading, speed = (part.detach()[..., _READ_EVERY - 1 :: _READ_EVERY] for part in path)
         where = torch.stack([x / 30, y / 30, heading, speed / 15], dim=-1)

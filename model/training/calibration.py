@@ -12,17 +12,19 @@ fits by likelihood, too).
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 import torch
 import torch.nn.functional as F
+from torch import Tensor
 
 from model.arrays import Floats
 from model.forecaster import Context
 from model.metrics.density import LABEL_NOISE_M, nll
-from model.mixture import TrajectoryMixture
-from model.networks.covernet import CoverNet
+from model.mixture import TrajectoryMixture, merge_modes
+from model.networks.agent_frame import AgentFrameNetwork, Modes
+from model.networks.covernet import CoverNet, turned
 from model.networks.decoder import ModeDecoder
 from model.networks.network import AgentNetwork
 from model.training.source import BatchSource
@@ -65,6 +67,94 @@ class Calibration(NamedTuple):
             self.width**2 * mixture.covariances,
             mixture.origin,
         )
+
+
+class HorizonCalibration(NamedTuple):
+    """What is done to the forecasts of a network in the agent's frame."""
+
+    widths: tuple[float, ...]
+    """Factor on the standard deviations at each step, above the network's floor."""
+    temperature: float
+    """Divisor of the modes' logits."""
+
+    @property
+    def ran_away(self) -> bool:
+        """Whether a number came to a bound of its search."""
+        return any(
+            not numbers[0] * _NEAR < number < numbers[-1] / _NEAR
+            for numbers, fitted in ((_WIDTHS, self.widths), (_TEMPERATURES, (self.temperature,)))
+            for number in fitted
+        )
+
+
+AnyCalibration: TypeAlias = Calibration | HorizonCalibration
+
+_WIDTHS: Final = tuple(0.4 * 1.04**power for power in range(60))
+_TEMPERATURES: Final = tuple(0.4 * 1.06**power for power in range(50))
+
+
+@torch.no_grad()
+def fit_by_horizon(network: AgentFrameNetwork, pairs: BatchSource) -> HorizonCalibration:
+    """Return the widths and the temperature under which the pairs' positions are the likeliest, once modes
+    that a planner would not tell apart have been merged.
+
+    Args:
+        network: in evaluation mode, not calibrated yet.
+        pairs: that it was not trained on.
+    """
+    judged = _judge_paths(network, pairs)
+    widths, temperature = torch.ones_like(network.width), 1.0
+    for _ in range(_TURNS):
+        by_width = torch.stack(
+            [_unlikely_steps(network, judged, w * torch.ones_like(widths), temperature) for w in _WIDTHS]
+        )
+        widths = torch.tensor(_WIDTHS)[by_width.argmin(dim=0)]
+        by_temperature = [
+            _unlikely_steps(network, judged, widths, one).mean().item() for one in _TEMPERATURES
+        ]
+        temperature = _TEMPERATURES[int(np.argmin(by_temperature))]
+    return HorizonCalibration(tuple(widths.tolist()), temperature)
+
+
+_JudgedPaths = Sequence[tuple[Modes, Floats]]
+"""Forecasts in the agents' frames, and where the agents went: [N, T, 2], m."""
+
+
+def _judge_paths(network: AgentFrameNetwork, pairs: BatchSource) -> _JudgedPaths:
+    chosen = torch.linspace(0, len(pairs) - 1, min(PAIRS, len(pairs))).long().unique()
+    judged = []
+    for indices in chosen.split(_BATCH):
+        features, future = pairs.batch(indices)
+        modes = network.decode(network.encode(features, Context.FULL), features, Context.FULL)
+        truth = turned(future, -features["heading"].to(future.dtype))
+        judged.append((modes, truth.double().cpu().numpy()))
+    return judged
+
+
+def _unlikely_steps(
+    network: AgentFrameNetwork, judged: _JudgedPaths, widths: Tensor, temperature: float
+) -> Tensor:
+    """Return the mean negative log-likelihood of merged forecasts at each step: [T]."""
+    kept = network.width.clone()
+    network.width.copy_(widths)
+    steps = []
+    for modes, truth in judged:
+        mixture = TrajectoryMixture(
+            F.log_softmax(modes.logits / temperature, dim=1).cpu(),
+            torch.stack([modes.path.x, modes.path.y], dim=-1).cpu(),
+            network.covariance(modes).cpu(),
+            torch.zeros(len(truth), 2, dtype=torch.float64),
+        )
+        steps.append(nll(merge_modes(mixture).mixture, truth, LABEL_NOISE_M))
+    network.width.copy_(kept)
+    return torch.from_numpy(np.nanmean(np.concatenate(steps), axis=0))
+
+
+@torch.no_grad()
+def calibrate_by_horizon(network: AgentFrameNetwork, calibration: HorizonCalibration) -> None:
+    """Build a calibration into a network's buffers."""
+    network.width.mul_(torch.tensor(calibration.widths, device=network.width.device))
+    network.temperature.mul_(calibration.temperature)
 
 
 @torch.no_grad()

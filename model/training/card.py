@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from model.forecaster import Protocol
-from model.training.calibration import Calibration
+from model.training.calibration import AnyCalibration, HorizonCalibration
 from model.training.config import TrainingConfig
 from model.training.state import Progress
 
@@ -17,8 +17,10 @@ class Origin:
     data: str
     """The data set and its pairs, in words."""
     protocol: Protocol
-    validation: str
+    reported: str
     """The split that the figures are of, in words."""
+    chosen_on: str
+    """The split that the epoch was chosen on, and that a calibration by horizon was fitted to."""
     command: str
     """That makes it, without the paths of the machine that did."""
     machine: str
@@ -30,7 +32,7 @@ def model_card(
     progress: Progress,
     version: str,
     figures: dict[str, float],
-    calibration: Calibration | None,
+    calibration: AnyCalibration | None,
 ) -> str:
     """Markdown.
 
@@ -66,8 +68,7 @@ def model_card(
 
 ## Figures
 
-On {origin.validation}, {origin.protocol.value} protocol. The epoch was chosen by the FDE of the likeliest
-mode on this same split.
+On {origin.reported}, {origin.protocol.value} protocol. {_choice(config, origin)}
 
 | figure | value |
 |---|---|
@@ -81,13 +82,30 @@ mode on this same split.
 """
 
 
+def _choice(config: TrainingConfig, origin: Origin) -> str:
+    if config.keep == "last":
+        return "The last epoch was kept, whatever its figures."
+    same = origin.reported.startswith(origin.chosen_on)
+    return (
+        "The epoch was chosen by the FDE of the likeliest\nmode on "
+        f"{'this same split' if same else origin.chosen_on}."
+    )
+
+
 RAN_AWAY = "a number ran to the bound of its search: the likelihood asks for more of it than is reasonable"
 """Said of such a calibration, on the card and while training."""
 
 
-def _calibration(calibration: Calibration | None) -> str:
+def _calibration(calibration: AnyCalibration | None) -> str:
     if calibration is None:
         return "none, the forecasts are as sure of themselves as the method has them"
+    if isinstance(calibration, HorizonCalibration):
+        widths = ", ".join(f"{width:.2f}" for width in calibration.widths)
+        return (
+            f"standard deviations of the 12 steps times {widths}, logits of the modes divided by "
+            f"{calibration.temperature:.2f}, fitted after training to merged forecasts of held-out pairs, so "
+            f"that their positions are the likeliest{f'; {RAN_AWAY}' if calibration.ran_away else ''}"
+        )
     blind = calibration.blind_width
     of_blind = "" if blind is None else f" (of blind forecasts {blind:.3f})"
     return (

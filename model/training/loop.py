@@ -118,7 +118,8 @@ class Trainer:
                 f"the run has diverged: after epoch {self.progress.epoch} no forecast is a number; a smaller "
                 "learning rate may help"
             )
-        if self.progress.best_score is None or score < self.progress.best_score:
+        better = self.progress.best_score is None or score < self.progress.best_score
+        if better or self.config.keep == "last":
             self.progress = replace(self.progress, best_epoch=self.progress.epoch, best_score=score)
             self._keep_best()
         return figures

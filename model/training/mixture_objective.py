@@ -1,4 +1,4 @@
-"""The objective of networks in the agent's frame: a mixture whose modes differ and whose weights mean something.
+"""The objective of networks in the agent's frame: modes that differ, and weights that mean something.
 
 It joins what measurements asked for (``docs/experiments.md``): the likelihood of the mixture with the weights
 p(z | x) themselves, a pull of the nearest mode towards the truth (multiple choice learning; Guzman-Rivera et
@@ -33,6 +33,12 @@ class MixtureWeights(BaseModel):
     """Of that of the whole trajectory, nats a step."""
     nearest: float = Field(default=1.0, ge=0)
     """1/m, of the mean distance of the nearest mode."""
+    nearest_of_5: float = Field(default=0.0, ge=0)
+    """Likewise of the nearest of the five likeliest: those are what a planner and the devkit look at."""
+    nearest_of_10: float = Field(default=0.0, ge=0)
+    """Likewise of the ten likeliest."""
+    likeliest: float = Field(default=0.0, ge=0)
+    """1/m, of the mean distance of the likeliest mode; its probability has no part in this."""
     choice: float = Field(default=0.0, ge=0)
     """Of the cross-entropy of p(z | x) with modes chosen by their distances."""
     choice_range_m: float = Field(default=1.0, gt=0)
@@ -95,6 +101,7 @@ def _terms(
     score = (mean_distance + 0.5 * distance[..., -1]).detach()
     nearest = score.argmin(dim=1, keepdim=True)
     pulled = mean_distance.gather(1, nearest).mean()
+    ranked = log_weights.argsort(dim=1, descending=True)
     expected = (log_weights.exp() * mean_distance).sum(dim=1).mean()
     value = weights.likelihood * nll + weights.nearest * pulled + weights.expected * expected
     of_proposal = proposed.mean(dim=-1)
@@ -103,6 +110,13 @@ def _terms(
         + weights.expected * (log_weights.exp().detach() * of_proposal).sum(dim=1).mean()
     )
     named = {"nll": nll, "nearest_m": pulled, "expected_m": expected}
+    for count, weight in ((1, weights.likeliest), (5, weights.nearest_of_5), (10, weights.nearest_of_10)):
+        if weight:
+            first = ranked[:, :count]
+            chosen = first.gather(1, score.gather(1, first).argmin(dim=1, keepdim=True))
+            distance_m = mean_distance.gather(1, chosen).mean()
+            value = value + weight * distance_m
+            named[f"nearest_of_{count}_m"] = distance_m
     if weights.joint_likelihood:
         steps = future.shape[1]
         joint = -torch.logsumexp(log_weights + density.sum(dim=-1), dim=1).mean() / steps

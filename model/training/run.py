@@ -9,19 +9,27 @@ from pathlib import Path
 import torch
 
 from model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from model.data.batches import Batches
+from model.data.batches import Batches, JoinedPairs
 from model.data.cache import Cache
 from model.data.caches import open_cache
 from model.data.scenes import Reader
 from model.data.sources import READERS
 from model.forecaster import ModelInfo, Protocol
+from model.networks.agent_frame import AgentFrameNetwork
 from model.scene import AgentType
 from model.training import processes
-from model.training.calibration import calibrate, fit_calibration
+from model.training.calibration import (
+    AnyCalibration,
+    calibrate,
+    calibrate_by_horizon,
+    fit_by_horizon,
+    fit_calibration,
+)
 from model.training.card import LICENSE, RAN_AWAY, Origin, model_card
 from model.training.config import TrainingConfig
 from model.training.logs import RunLog
 from model.training.loop import Report, Trainer
+from model.training.source import BatchSource
 from model.training.state import Progress
 from model.training.validation import Validation
 
@@ -40,6 +48,10 @@ class Source:
     train_split: str
     validation_split: str
     protocol: Protocol
+    report_split: str | None = None
+    """The split that the card's figures are of; None: the validation split."""
+    also: tuple[tuple[str, Path, str], ...] = ()
+    """Kind, path and split of more pairs to train on."""
 
     def reader(self) -> Reader:
         """Opens the data.
@@ -87,10 +99,10 @@ class Run:
         """
         device = _device()
         first = processes.join(device)
-        splits = (self.source.train_split, self.source.validation_split)
-        train, judged = processes.first_alone(lambda: [self._open_cache(split, said) for split in splits])
-        validation = Validation(judged, self.config.network, device)
-        batches = Batches(train, device, self.config.network)
+        train, judged, reported = processes.first_alone(lambda: self._open_caches(said))
+        network = self.config.network
+        validation = Validation(judged, network, device)
+        batches = JoinedPairs([Batches(cache, device, network, packed_maps=True) for cache in train])
         parameters = None if self.start is None else self.start.tensors
         trainer = Trainer(self.config, batches, validation, self.out, device, parameters)
         with RunLog(self.out) as log:
@@ -101,42 +113,73 @@ class Run:
 
             trainer.run(add, lambda done, of: tick(trainer.progress.epoch + 1, done, of))
         if first:
-            data = f"{self.source.kind}, split {self.source.train_split}: {len(train)} pairs"
-            split = f"{self.source.kind}, split {self.source.validation_split} ({len(judged)} pairs)"
-            origin = Origin(data, self.source.protocol, split, self._command(), _machine())
-            self._write_checkpoint(trainer, batches, validation, origin, said)
+            source = self.source
+            names = [(source.kind, source.train_split), *((kind, split) for kind, _, split in source.also)]
+            data = "; ".join(
+                f"{kind}, split {split}: {_pairs(cache)} pairs"
+                for (kind, split), cache in zip(names, train, strict=True)
+            )
+            split = f"{source.kind}, split {source.report_split or source.validation_split}"
+            origin = Origin(
+                data,
+                source.protocol,
+                f"{split} ({len(reported)} pairs)",
+                f"{source.kind}, split {source.validation_split}",
+                self._command(),
+                _machine(),
+            )
+            report_on = Validation(reported, network, device)
+            self._write_checkpoint(trainer, batches, validation, report_on, origin, said)
         return self.out / "checkpoint"
 
     def _command(self) -> str:
         """What repeats the run, in terms of any machine."""
         source = self.source
         start = "" if self.start is None else " --start START"
+        also = "".join(
+            f"--also {kind}:{path if kind == 'synthetic' else 'DATA'}@{split} "
+            for kind, path, split in source.also
+        )
+        report = "" if source.report_split is None else f"--report-split {source.report_split} "
         return (
             f"cab-forecast train {self.config.method.value} --data {source.kind}:DATA "
             f"--protocol {source.protocol.value} --train-split {source.train_split} "
-            f"--validation-split {source.validation_split} --version {self.version} "
+            f"--validation-split {source.validation_split} {also}{report}--version {self.version} "
             f"--config SETTINGS.toml{start} --out OUT"
         )
 
-    def _open_cache(self, split: str, said: Callable[[str], None]) -> Cache:
-        """The cache of a split, made first where it is not there or stale."""
+    def _open_caches(self, said: Callable[[str], None]) -> tuple[list[Cache], Cache, Cache]:
+        """Return the caches to train on, to choose the epoch on, and to report on; they are made first where
+        they are not there or stale."""
         source, config = self.source, self.config
-        return open_cache(
-            self.cache,
-            source.reader(),
-            source.kind,
-            split,
-            source.protocol,
-            config.network,
-            config.history_frames,
-            said,
-        )
+        reader = source.reader()
+
+        def opened(kind: str, reader: Reader, split: str, variants: int = 0) -> Cache:
+            return open_cache(
+                self.cache,
+                reader,
+                kind,
+                split,
+                source.protocol,
+                config.network,
+                config.history_frames,
+                said,
+                variants,
+            )
+
+        train = [opened(source.kind, reader, source.train_split, config.variants)]
+        for kind, path, split in source.also:
+            train.append(opened(kind, READERS[kind](path), split, config.variants))
+        judged = opened(source.kind, reader, source.validation_split)
+        reported = judged if source.report_split is None else opened(source.kind, reader, source.report_split)
+        return train, judged, reported
 
     def _write_checkpoint(
         self,
         trainer: Trainer,
-        train: Batches,
+        train: BatchSource,
         validation: Validation,
+        report_on: Validation,
         origin: Origin,
         said: Callable[[str], None],
     ) -> None:
@@ -144,14 +187,18 @@ class Run:
         config, network = self.config, trainer.networks.config
         trainer.networks.load_state_dict(trainer.best())
         trainer.networks.eval()
-        calibration = None
+        calibration: AnyCalibration | None = None
         if config.calibrate:
             vehicles = trainer.networks.of(AgentType.VEHICLE)
-            calibration = fit_calibration(vehicles, train)
-            calibrate(vehicles, calibration)
+            if isinstance(vehicles, AgentFrameNetwork):
+                calibration = fit_by_horizon(vehicles, validation.pairs)
+                calibrate_by_horizon(vehicles, calibration)
+            else:
+                calibration = fit_calibration(vehicles, train)
+                calibrate(vehicles, calibration)
             if calibration.ran_away:
                 said(f"calibration: {RAN_AWAY}")
-        figures = validation.judge(trainer.networks, samples=SAMPLES, draws=DRAWS)
+        figures = report_on.judge(trainer.networks, samples=SAMPLES, draws=DRAWS)
         begun = "" if config.start is None else f"; begun with {config.start}"
         info = ModelInfo(
             name=config.method.value,
@@ -174,6 +221,11 @@ class Run:
         folder = self.out / "checkpoint"
         save_checkpoint(folder, info, network, tensors, card)
         load_checkpoint(folder).forecaster()  # what cannot be read again is no checkpoint
+
+
+def _pairs(cache: Cache) -> int:
+    """Return how many pairs a cache is of, their variants not counted."""
+    return len(cache) // (1 + cache.manifest.key.variants)
 
 
 def _device() -> torch.device:

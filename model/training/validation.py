@@ -70,6 +70,11 @@ class Validation:
         """The figures that need no samples, quick enough for after each epoch."""
         return self.judge(networks, samples=0, draws=0)
 
+    @property
+    def pairs(self) -> Batches:
+        """The pairs themselves."""
+        return self._batches
+
     def __len__(self) -> int:
         """How many pairs there are."""
         return len(self._batches)

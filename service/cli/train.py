@@ -25,6 +25,13 @@ def register(app: typer.Typer) -> None:
         protocol: Annotated[str, typer.Option(help="causal, or paper to compare with tables")] = "causal",
         train_split: Annotated[str, typer.Option(help="Split to train on.")] = "train",
         validation_split: Annotated[str, typer.Option(help="Split to choose the epoch by.")] = "train_val",
+        also: Annotated[
+            list[str] | None,
+            typer.Option(help="KIND:PATH@SPLIT of more pairs to train on; may be repeated."),
+        ] = None,
+        report_split: Annotated[
+            str | None, typer.Option(help="Split of the card's figures; default: the validation split.")
+        ] = None,
         cache: Annotated[Path | None, typer.Option(help="Folder of caches; default: OUT/cache.")] = None,
         config: Annotated[Path | None, typer.Option(help="TOML; default: the method's own.")] = None,
         published: Annotated[
@@ -46,7 +53,7 @@ def register(app: typer.Typer) -> None:
         """Trains a method and writes its best epoch as a checkpoint that serve loads."""
         from model.checkpoint import CheckpointError, load_checkpoint  # noqa: PLC0415 (torch is slow to import)
         from model.data.scenes import DataError  # noqa: PLC0415
-        from model.data.sources import parse_data, parse_protocol  # noqa: PLC0415
+        from model.data.sources import parse_also, parse_data, parse_protocol  # noqa: PLC0415
         from model.forecaster import Protocol  # noqa: PLC0415
         from model.training.config import TrainingError, load_config, parse_method  # noqa: PLC0415
         from model.training.run import Run, Source  # noqa: PLC0415
@@ -59,7 +66,15 @@ def register(app: typer.Typer) -> None:
             if begun is not None:
                 changes["start"] = f"{begun.info.full_name} ({begun.info.protocol.value})"
             kind, path = parse_data(data)
-            source = Source(kind, path, train_split, validation_split, parse_protocol(protocol))
+            source = Source(
+                kind,
+                path,
+                train_split,
+                validation_split,
+                parse_protocol(protocol),
+                report_split,
+                tuple(parse_also(one) for one in also or ()),
+            )
             default = "1.0.0+paper" if source.protocol is Protocol.PAPER else "1.0.0"
             settings = load_config(parse_method(method), config, published=published, **changes)
             show_training(Run(settings, source, out, cache or out / "cache", version or default, begun))
