@@ -7,7 +7,7 @@ from typing import TypeAlias
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from model import features, geometry, inputs, neighbors, raster, resample, standardization, surroundings
+from model import features, fit, geometry, inputs, neighbors, raster, resample, standardization, surroundings
 from model.data import packing, protocols
 from model.data.checks import FUTURE_STEPS
 from model.data.scenes import Reader
@@ -22,7 +22,7 @@ FORMAT_VERSION = 1
 MANIFEST_FILE = "manifest.json"
 RASTERS_FILE = "rasters.u8"
 
-_DERIVED_BY = (resample, features, neighbors, standardization, geometry, protocols, packing)
+_DERIVED_BY = (resample, fit, features, neighbors, standardization, geometry, protocols, packing)
 _DRAWN_BY = (inputs, surroundings, raster)
 
 Layout: TypeAlias = dict[str, tuple[type[np.generic], tuple[int, ...]]]
