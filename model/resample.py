@@ -2,7 +2,9 @@
 
 Causal: a grid state depends on what was observed up to the present, never on the future (REFERENCE:
 the papers' released preprocessing differentiates centrally over whole tracks; a live service cannot).
-What an observation gives is used as it is; what it does not give is derived by backward differences.
+At 2 Hz what an observation gives is used as it is, and what it does not give is derived by backward
+differences. Denser observations are evidence, to which the states are fitted (``model.fit``); in between,
+from 2.5 to some 4.5 Hz, the one passes over into the other.
 """
 
 from collections.abc import Callable
@@ -11,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from model.arrays import Bools, Floats, Ints
+from model.fit import MIN_HEADING_SPEED, Fitted, fit
 from model.geometry import wrap_angle
 from model.observations import Observations
 from model.scene import STEP_SECONDS, AgentStates
@@ -23,31 +26,40 @@ MAX_GAP = 1.05
 """s; positions are interpolated between observations no further apart: one lost frame at 2 Hz."""
 MIN_DIFFERENCE_SPAN = 0.05
 """s; a shorter span makes a difference quotient of noise."""
-MIN_HEADING_SPEED = 0.5
-"""m/s; the direction of motion tells the heading from this speed on."""
+FLIP_SPEED = 2.0
+"""m/s; from this speed on, motion shows that a single heading is the wrong way round."""
 
 # Two frames older than those returned: the oldest velocity and acceleration are then differences, too,
 # wherever the agent has been seen that long.
 _EXTRA_FRAMES = 2
+_MIN_FLIP_SPAN = 0.15  # s; observations nearer to each other are fitted, and their differences are noise
 _ROUNDING = 1e-6  # s; of differences of times since the epoch (a quarter of it at float64), with room
 
 
 def resample(observations: Observations, time: float, frames: int) -> AgentStates:
     """States on the grid ``time − k · 0.5 s``.
 
-    Positions, and given headings, velocities and so on, are interpolated linearly between observations
-    at most ``MAX_GAP`` apart; history before a wider gap is dropped. Derivatives that are not given are
-    backward differences on the grid, of values that are both given or both derived; where the oldest
-    frame has no predecessor, its velocity and heading rate are those of the next frame and its
-    acceleration is zero. A heading that is not given is the direction of motion from
-    ``MIN_HEADING_SPEED`` on (the opposite one for an agent whose given headings show that it reverses),
-    else the last known one.
+    At 2 Hz positions, and given headings, velocities and so on, are those of the observations at the grid
+    times; between observations at most ``MAX_GAP`` apart they are interpolated linearly; history before a
+    wider gap is dropped. Derivatives that are not given are backward differences on the grid, of values that
+    are both given or both derived; where the oldest frame has no predecessor, its velocity and heading rate
+    are those of the next frame and its acceleration is zero. A single given heading that points backwards
+    (more than 90° off the motion, at ``FLIP_SPEED`` or more, and off the headings before and after it) is
+    replaced by the direction of motion.
+
+    Where observations are denser, position, velocity, acceleration, heading and heading rate are those of a
+    fit to the observations within ``model.fit.WINDOW`` before the grid time and, up to the present, after
+    it. Given velocities, accelerations and heading rates are measurements like others. So is the course over
+    ground, for the heading of what moves; an agent that reverses keeps its headings.
+
+    A heading that is not given is the direction of motion from ``MIN_HEADING_SPEED`` on (the opposite one
+    for an agent whose given headings show that it reverses), else the last known one.
 
     An agent last seen up to ``MAX_AGE`` ago is carried to the present at its velocity then; velocity,
-    acceleration, heading and heading rate are those of its newest observation.
+    acceleration, heading and heading rate are those of when it was last seen.
 
     Args:
-        observations: N agents; none later than ``time`` (+ tolerance).
+        observations: N agents; those later than ``time`` (+ tolerance) are not looked at.
         time: the present, s.
         frames: F, how many frames to return at most.
 
@@ -55,26 +67,108 @@ def resample(observations: Observations, time: float, frames: int) -> AgentState
         [N, F, …]; ``first`` is F for an agent that is not observed now.
     """
     count = frames + _EXTRA_FRAMES
-    newest = _newest_time(observations)
-    sampled = _sample(observations, _grid(np.full(len(newest), time), count))
+    seen = _upright(_until(observations, time))
+    newest = _newest_time(seen)
     age = time - newest
     carried = (age > TIME_TOLERANCE) & (age <= MAX_AGE + TIME_TOLERANCE)
-    if carried.any():
-        # How it moved when last seen: the same derivation, on a grid that ends there
-        last = _derive(_sample(observations, _grid(newest, count)))
-        ahead = last.velocity[carried, -1] * age[carried, None]
-        sampled.position[carried, -1] = last.position[carried, -1] + ahead
-    states = _derive(sampled)
-    if carried.any():
-        for name in ("velocity", "acceleration", "heading", "heading_rate"):
-            getattr(states, name)[carried, -1] = getattr(last, name)[carried, -1]
-    known = _last_velocity_known(observations) & (states.first < count)
-    return replace(states, velocity_known=known).last_frames(frames)
+    states = _as_observed(seen, time, count, carried).last_frames(frames)
+    times = _grid(np.full(len(newest), time), states.frames)
+    times[carried, -1] = newest[carried]
+    return _fitted(states, fit(seen, times), np.where(carried, age, 0.0))
 
 
 def history_seconds(frames: int) -> float:
     """How far before the present ``resample`` looks for so many frames, s."""
     return (frames + _EXTRA_FRAMES - 1) * STEP_SECONDS + MAX_AGE + MAX_GAP
+
+
+def _until(obs: Observations, time: float) -> Observations:
+    """The observations up to a time (+ tolerance); the others become padding, but for an only one."""
+    later = np.isfinite(obs.time) & (obs.time > time + TIME_TOLERANCE)
+    later[:, 0] = False
+    if not later.any():
+        return obs
+    return replace(obs, count=obs.count - later.sum(axis=1), time=np.where(later, np.inf, obs.time))
+
+
+def _upright(obs: Observations) -> Observations:
+    """Turns single headings about that motion and the headings beside them contradict, where observations
+    are too far apart to be fitted."""
+    with np.errstate(invalid="ignore"):  # the padding's differences
+        span = np.diff(obs.time, axis=1)
+    connected = (span >= _MIN_FLIP_SPAN) & (span <= MAX_GAP + _ROUNDING)
+    before, after = obs.heading[:, :-1], obs.heading[:, 1:]
+    if not (connected & np.isfinite(before) & np.isfinite(after)).any():
+        return obs
+    moved = np.diff(obs.position, axis=1) / np.where(connected, span, np.inf)[..., None]
+    fast = np.hypot(moved[..., 0], moved[..., 1]) >= FLIP_SPEED
+    direction = np.where(fast, np.arctan2(moved[..., 1], moved[..., 0]), np.nan)
+    direction = np.concatenate([direction[:, :1], direction], axis=1)  # the first one's is that to the next
+    apart = np.where(connected, np.abs(wrap_angle(after - before)), np.nan)
+    none = np.full_like(apart[:, :1], np.nan)
+    beside = np.stack([np.concatenate([none, apart], axis=1), np.concatenate([apart, none], axis=1)])
+    opposed = (beside > np.pi / 2).any(axis=0) & ~(beside <= np.pi / 2).any(axis=0)
+    flipped = opposed & (np.abs(wrap_angle(obs.heading - direction)) > np.pi / 2)
+    return replace(obs, heading=np.where(flipped, direction, obs.heading)) if flipped.any() else obs
+
+
+def _as_observed(obs: Observations, time: float, count: int, carried: Bools) -> AgentStates:
+    """States as the observations nearest to the grid times have them.
+
+    Args:
+        obs: N agents.
+        time: the present, s.
+        count: E, frames.
+        carried: [N], which agents were last seen a while ago.
+    """
+    newest = _newest_time(obs)
+    sampled = _sample(obs, _grid(np.full(len(newest), time), count))
+    if carried.any():
+        # How it moved when last seen: the same derivation, on a grid that ends there
+        last = _derive(_sample(obs, _grid(newest, count)))
+        ahead = last.velocity[carried, -1] * (time - newest[carried])[:, None]
+        sampled.position[carried, -1] = last.position[carried, -1] + ahead
+    states = _derive(sampled)
+    if carried.any():
+        for name in ("velocity", "acceleration", "heading", "heading_rate"):
+            getattr(states, name)[carried, -1] = getattr(last, name)[carried, -1]
+    return replace(states, velocity_known=_last_velocity_known(obs) & (states.first < count))
+
+
+def _fitted(states: AgentStates, fitted: Fitted, ahead: Floats) -> AgentStates:
+    """Goes from states as observed to fitted ones as far as the fit's share says; without it, not a bit.
+
+    Args:
+        states: [N, E].
+        fitted: [N, E].
+        ahead: [N], s that the last frame's is to be carried on.
+    """
+    share = np.where(states.observed, fitted.share, 0.0)
+    some = share > 0
+    if not some.any():
+        return states
+
+    def mix(observed: Floats, other: Floats) -> Floats:
+        part, mask = (a.reshape(a.shape + (1,) * (observed.ndim - 2)) for a in (share, some))
+        return np.where(mask, observed + part * (other - observed), observed)
+
+    position = fitted.position.copy()
+    position[:, -1] += fitted.velocity[:, -1] * ahead[:, None]
+    # The last known heading is carried from fit to fit; where no fit knows one, it is the observed states'
+    course = _reversed_where_given_so(fitted.course, fitted.heading)
+    heading = np.where(np.isfinite(fitted.heading), fitted.heading, course)
+    heading = _carry(np.where(some, heading, np.nan), states.observed)
+    heading = np.where(np.isfinite(heading), heading, states.heading)
+    unknown = ~np.isfinite(states.heading)
+    turned = wrap_angle(states.heading + share * wrap_angle(heading - states.heading))
+    return replace(
+        states,
+        position=mix(states.position, position),
+        velocity=mix(states.velocity, fitted.velocity),
+        acceleration=mix(states.acceleration, fitted.acceleration),
+        heading=np.where(some, np.where(unknown, heading, turned), states.heading),
+        heading_rate=mix(states.heading_rate, fitted.heading_rate),
+    )
 
 
 def _grid(ends: Floats, frames: int) -> Floats:

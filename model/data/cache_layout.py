@@ -15,7 +15,7 @@ from model.scene import AgentType
 from model.standardization import STATE_SIZE
 from model.surroundings import BOX_NUMBERS, BOXES
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 """Version of the folder's layout and of how its arrays are derived from the data: whoever changes either
 (resampling, features, sensing) raises it, and caches of other versions are built anew."""
 MANIFEST_FILE = "manifest.json"

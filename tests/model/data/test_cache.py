@@ -170,7 +170,7 @@ def _manifest(change: dict[str, object]) -> Callable[[Path], None]:
         (lambda folder: (folder / "manifest.json").unlink(), "manifest.json: there is no such file"),
         (lambda folder: (folder / "manifest.json").write_text("{"), "manifest.json: cannot be read"),
         (lambda folder: (folder / "manifest.json").write_text("[1]"), r"manifest.json: "),
-        (_manifest({"format_version": 99}), "format version 99, not 2"),
+        (_manifest({"format_version": 99}), "format version 99, not 3"),
         (_manifest({"pairs": 0}), "manifest.json: pairs"),
         (_manifest({"pairs": 3}), r"\.npy: holds .* not .*3"),
         (_manifest({"more": 3}), "manifest.json: more"),

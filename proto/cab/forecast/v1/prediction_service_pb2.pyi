@@ -171,12 +171,23 @@ class Agent(_message.Message):
         at least one, at most 512 by default. A single one needs its velocity; without it another observation
         0.05 s to 1.05 s before it. Successive ones may be 100 m/s · Δt + 5 m apart.
 
-        Any rate: they are resampled onto time − k · 0.5 s, linearly between observations at most 1.05 s apart;
-        what lies before a wider gap, and a grid time before the first observation, is not used (send a little
-        more than the model's history where frames jitter). The newest must be at most 0.5 s old; it is carried
-        to the present at its velocity. What is not given is derived by backward differences; what is given at
-        a grid time is used as it is. A heading that is not given is the direction of motion from 0.5 m/s on;
-        where nothing tells it, models that need it leave the agent to the fallback.
+        Any rate: they are brought onto time − k · 0.5 s. Send all there are: observations denser than 2 Hz are
+        evidence, and each grid state is fitted to those within 1.05 s of it and up to the present (locally
+        constant acceleration and turn rate, from some 4.5 Hz on; from 2.5 Hz on in part). Given velocities,
+        accelerations and heading rates are measurements there like positions and headings; so is the course over
+        ground, for the heading of what moves. A flipped heading is outvoted by the others and by the motion;
+        headings that point backwards steadily, below some 6 m/s, are those of an agent that reverses.
+
+        At 2 Hz what is given at a grid time is used as it is, and what is not given is derived by backward
+        differences; in between, up to 1.05 s, states are interpolated linearly. Only a single heading more than
+        90° off the motion, at 2 m/s or more, and off the headings before and after it is replaced by the
+        direction of motion.
+
+        What lies before a gap wider than 1.05 s, and a grid time before the first observation, is not used (send
+        a little more than the model's history where frames jitter). The newest must be at most 0.5 s old; it is
+        carried to the present at its velocity. A heading that is not given is the direction of motion from
+        0.5 m/s on, else the last known one; where nothing tells it, models that need it leave the agent to the
+        fallback.
         """
 
     @_builtins.property
