@@ -467,7 +467,7 @@ def _add_reversing(rng: np.random.Generator, plan: _Plan, road: Road) -> None:
     driver = draw_driver(rng, rng.uniform(1.0, 3.0))
     driver = replace(driver, acceleration=rng.uniform(0.4, 1.2), braking=rng.uniform(0.5, 1.5))
     vehicle = Vehicle(line, place, 0.0, 0.0, driver, _OWN_STREAMS + len(plan.vehicles))
-    vehicle.brakes = (0.0, rng.uniform(0.0, 0.6) * plan.seconds, 2.0)
+    vehicle.brakes = (0.0, rng.uniform(0.0, 5.0), 2.0)  # few are asked for before
     vehicle.backwards = vehicle.ends = True
     plan.vehicles.append(vehicle)
 
