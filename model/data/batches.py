@@ -6,6 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from model.agent_features import HISTORY_SCALE
+from model.arrays import Bools
 from model.data.cache import Cache
 from model.data.cache_layout import draws, in_agent_frame, neighbors_name
 from model.data.packing import unpack_patches
@@ -16,6 +18,7 @@ from model.forecaster import Features
 from model.geometry import rotate as rotate_vectors
 from model.networks.config import AnyNetworkConfig, NetworkConfig
 from model.scene import AgentType
+from model.standardization import state_scale
 
 
 class Batches:
@@ -76,6 +79,7 @@ class Batches:
         self._turned = torch.from_numpy(np.array(cache.turn))[:: 1 + key.variants]
         paths = rotate_vectors(cache.future.astype(np.float64), -cache.heading[:, None])
         self._paths = torch.from_numpy(paths.astype(np.float32))
+        self._leaving = torch.from_numpy(_leaving(cache))[:: 1 + key.variants]
         looks = config is None or config.looks_at_map(AgentType.VEHICLE)
         self._cut = PatchCutter(cache, device) if looks and not key.agent_frame else None
         self._device = device
@@ -88,6 +92,11 @@ class Batches:
     def turned(self) -> Tensor:
         """[P], rad, how far each pair's heading turns from its oldest to its farthest frame; on the CPU."""
         return self._turned
+
+    @property
+    def leaving(self) -> Tensor:
+        """[P] bool, pairs that stood for the whole history and leave within 3 s; on the CPU."""
+        return self._leaving
 
     @property
     def paths(self) -> Tensor:
@@ -128,6 +137,25 @@ class Batches:
         return features, self._future.index_select(0, indices)
 
 
+STOOD_M = 0.5
+"""m; who moved less over the whole history stood."""
+LEFT_M = 2.0
+"""m; who is farther away than that after 3 s has left."""
+
+
+def _leaving(cache: Cache) -> Bools:
+    """Return which rows stood for the whole history and leave within 3 s: [R]."""
+    scale = HISTORY_SCALE if cache.manifest.key.agent_frame else _GROUND_SCALE
+    begun = cache.history[:, 0, :2] * scale[:2]
+    stood = (cache.first == 0) & (np.hypot(begun[:, 0], begun[:, 1]) < STOOD_M)
+    after = cache.future[:, 5]
+    leaving: Bools = stood & (np.hypot(after[:, 0], after[:, 1]) > LEFT_M)
+    return leaving
+
+
+_GROUND_SCALE = state_scale(AgentType.VEHICLE, AgentType.VEHICLE)
+
+
 def _packed_patches(cache: Cache, config: AnyNetworkConfig | None, device: torch.device) -> dict[str, Tensor]:
     """Return the packed map patches that a network of the agent's frame looks at, by feature."""
     near = config is None or config.uses_map
@@ -155,6 +183,11 @@ class JoinedPairs:
     def turned(self) -> Tensor:
         """[P], as of ``Batches``."""
         return torch.cat([one.turned for one in self._sources])
+
+    @property
+    def leaving(self) -> Tensor:
+        """[P], as of ``Batches``."""
+        return torch.cat([one.leaving for one in self._sources])
 
     @property
     def paths(self) -> Tensor:

@@ -30,6 +30,9 @@ from model.standardization import STATE_SIZE
 
 STEPS = 12
 """T, steps of 0.5 s that are decoded."""
+_SECONDS = tuple(STEP_SECONDS * step for step in range(1, STEPS + 1))
+_USUAL_LOG_SIGMA = tuple((math.log(0.15 * s**1.5), math.log(0.08 * s**1.3)) for s in _SECONDS)
+"""[T, 2], of standard deviations along and across a path in m, from which the decoder's outputs depart."""
 _WIDTH = 64
 """Of every encoding."""
 _HIDDEN = 128
@@ -162,10 +165,6 @@ class AgentFrameNetwork(nn.Module):
     no neighbours, which is also what a call without map and neighbours gives it.
     """
 
-    usual_log_sigma: Tensor
-    """[T, 2], of standard deviations along and across a path, where the decoder begins."""
-    variance_floor: Tensor
-    """[T], m²."""
     width: Tensor
     """[T], factor on the standard deviations, fitted after training."""
     temperature: Tensor
@@ -202,13 +201,14 @@ class AgentFrameNetwork(nn.Module):
             nn.init.zeros_(head.bias)
             with torch.no_grad():
                 head.weight.mul_(0.1)
-        seconds = STEP_SECONDS * torch.arange(1, STEPS + 1)
-        usual = torch.stack([0.15 * seconds**1.5, 0.08 * seconds**1.3], dim=-1)
-        self.register_buffer("usual_log_sigma", usual.log(), persistent=False)
-        floor = config.min_sigma_m[0] + (config.min_sigma_m[1] - config.min_sigma_m[0]) * (seconds - 1) / 5
-        self.register_buffer("variance_floor", floor.square(), persistent=False)
         self.register_buffer("width", torch.ones(STEPS))
         self.register_buffer("temperature", torch.ones(()))
+
+    @property
+    def variance_floor(self) -> Tensor:
+        """[T], m², below which no variance of a forecast goes, in any direction."""
+        first, last = self.config.min_sigma_m
+        return self.width.new_tensor([(first + (last - first) * (s - 1) / 5) ** 2 for s in _SECONDS])
 
     def encode(self, features: Features, context: Context) -> Tensor:
         """Return the encoding of what the agent may see: [N, 128]."""
@@ -241,7 +241,8 @@ class AgentFrameNetwork(nn.Module):
         refined = F.relu(self.refine_hidden(torch.cat([hidden, read.flatten(2)], dim=-1)))
         controls = controls + self.refine(refined).unflatten(-1, (STEPS, 2))
         path = drive(controls * scale, heading, speed)
-        sigma = (self.usual_log_sigma + self.sigma(refined).unflatten(-1, (STEPS, 2)).clamp(-4, 4)).exp()
+        usual = self.width.new_tensor(_USUAL_LOG_SIGMA)
+        sigma = (usual + self.sigma(refined).unflatten(-1, (STEPS, 2)).clamp(-4, 4)).exp()
         logits = self.logits(refined)[..., 0] + self.mode_logits(encoding.relu())
         return Modes(logits, proposal, path, sigma)
 

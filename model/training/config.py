@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from model.networks.config import AnyNetworkConfig, CoverNetConfig
+from model.networks.config import AnyNetworkConfig, CoverNetConfig, Frame, NetworkConfig
 from model.training.mixture_objective import MixtureWeights
 from model.training.precision import Precision
 
@@ -39,6 +39,10 @@ class Method(StrEnum):
 
 BLIND = frozenset({Method.CAB, Method.REWEIGHT, Method.RUBIZ})
 """Methods whose objectives compare with a blind forecast."""
+
+
+IN_AGENT_FRAME = frozenset({Method.CAB, Method.TRAJECTRON, Method.TRAJECTRON_NO_CONTEXT})
+"""Methods that can be trained in the agent's frame."""
 
 
 class TrainingConfig(BaseModel):
@@ -77,6 +81,8 @@ class TrainingConfig(BaseModel):
     least_learning_rate: float = Field(default=1e-5, ge=0)
     cooldown_epochs: int = Field(default=0, ge=0)
     """The last epochs, over which the learning rate goes down to 0."""
+    warmup_steps: int = Field(default=0, ge=0)
+    """Steps over which the learning rate comes up from 0."""
     averaging: float = Field(default=0.0, ge=0, lt=1)
     """What a step leaves of the running mean of the parameters, e.g. 0.999; the mean is what is judged and
     kept. 0: the parameters themselves are."""
@@ -94,6 +100,10 @@ class TrainingConfig(BaseModel):
     """Exchange left and right around every other agent, at random; as released, no."""
     curved_copies: int = Field(default=2, ge=1)
     """How often an epoch shows a pair whose path is curved."""
+    leaving_share: float = Field(default=1.0, ge=0, le=1)
+    """Share of the pairs that stood for 2 s and leave within 3 s that an epoch shows. The prediction
+    challenge picks what moves: of its pairs that stood two in five leave, of everyday standing cars one in a
+    hundred."""
     seed: int = 0
     variants: int = Field(default=0, ge=0)
     """V, noisy reports of each training pair (``model.data.sensing``) that are drawn from beside the recorded
@@ -116,6 +126,16 @@ class TrainingConfig(BaseModel):
         return self
 
     @model_validator(mode="after")
+    def _frame_fits_settings(self) -> "TrainingConfig":
+        if not self.in_agent_frame and (self.variants or self.hide or "mixture" in self.model_fields_set):
+            raise ValueError("variants, hide and mixture are for networks of frame agent")
+        if self.in_agent_frame and self.rotate:
+            raise ValueError("rotate: turning the ground frame changes nothing for a network of frame agent")
+        if self.in_agent_frame and self.method not in IN_AGENT_FRAME:
+            raise ValueError(f"{self.method.value} has no objective for networks of frame agent yet")
+        return self
+
+    @model_validator(mode="after")
     def _mirrors_what_is_covered(self) -> "TrainingConfig":
         if self.mirror and self.method is Method.COVERNET:
             raise ValueError("mirror: covernet's set of trajectories does not cover mirrored ones")
@@ -135,10 +155,23 @@ class TrainingConfig(BaseModel):
     def toml(self) -> str:
         """The settings as a file for ``load_config``; what is given on the command line is left out."""
         values = self.model_dump(mode="json", exclude={"method", "start"}, exclude_none=True)
-        network = values.pop("network")
+        tables = {"mixture": values.pop("mixture"), "network": values.pop("network")}
+        if not self.in_agent_frame:
+            del tables["mixture"]
         # Strings, numbers, booleans and lists of them are written alike in JSON and TOML
         lines = [f"{name} = {json.dumps(value)}" for name, value in values.items()]
-        return "\n".join([*lines, "", "[network]", *(f"{n} = {json.dumps(v)}" for n, v in network.items())])
+        for table, settings in tables.items():
+            lines += [
+                "",
+                f"[{table}]",
+                *(f"{name} = {json.dumps(value)}" for name, value in settings.items()),
+            ]
+        return "\n".join(lines)
+
+    @property
+    def in_agent_frame(self) -> bool:
+        """Whether the network sees and forecasts in the agent's frame."""
+        return isinstance(self.network, NetworkConfig) and self.network.frame is Frame.AGENT
 
 
 def parse_method(name: str) -> Method:
@@ -162,7 +195,7 @@ def load_config(
         method: whose.
         file: TOML to take them from instead of the one that comes with the package.
         published: train as the released code does, but for ``calibrate`` and ``precision``; of the file, its
-            table ``published``, description and network (without ``max_control_sigma``) count.
+            table ``published``, description and network (without what the released one lacks) count.
         changes: single settings that go before the file's; None counts as not given. Of fewer epochs than are
             to cool down, all cool down.
 
@@ -199,7 +232,8 @@ def _as_published(values: Mapping[str, Any], released: object, source: str) -> d
         raise TrainingError(f"{source}: published: {', '.join(sorted(strange))} cannot be there")
     kept = {name: values[name] for name in ("description", "network") if name in values}
     if isinstance(network := kept.get("network"), dict):
-        kept["network"] = {name: value for name, value in network.items() if name != "max_control_sigma"}
+        ours = {"max_control_sigma", "frame", "far_map", "min_sigma_m"}
+        kept["network"] = {name: value for name, value in network.items() if name not in ours}
     return {**released, **kept}
 
 

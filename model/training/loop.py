@@ -76,8 +76,7 @@ class Trainer:
         if start is not None:
             begin_with(self.networks, start)
         self._average = running_mean(self.networks, config.averaging)
-        shown = len(epoch_order(train.turned, config.curved_copies, config.seed, epoch=0))
-        self._epoch_steps = shown // config.batch_size or 1
+        self._epoch_steps = len(self._order(epoch=0)) // config.batch_size or 1
         resumed = load_state(folder, config, self.learner, self._others())
         self.progress = resumed or Progress(epoch=0, step=0, best_epoch=0, best_score=None, seconds=0.0)
 
@@ -137,7 +136,7 @@ class Trainer:
         # What is random in an epoch hangs on its number alone
         torch.manual_seed(epoch_seed(config.seed, epoch) + processes.rank())
         generator = torch.Generator().manual_seed(epoch_seed(config.seed, epoch))
-        order = epoch_order(self._train.turned, config.curved_copies, config.seed, epoch)
+        order = self._order(epoch)
         for module in self.learner.modules().values():
             module.train()
         started = time.perf_counter()
@@ -155,6 +154,13 @@ class Trainer:
         seconds = time.perf_counter() - started
         self.progress = replace(self.progress, epoch=epoch + 1, seconds=self.progress.seconds + seconds)
         return means | {"learning_rate": self._rate(), "seconds": seconds}
+
+    def _order(self, epoch: int) -> Tensor:
+        """Return the pairs that an epoch shows, in its order."""
+        config, train = self.config, self._train
+        return epoch_order(
+            train.turned, config.curved_copies, config.seed, epoch, train.leaving, config.leaving_share
+        )
 
     def _batch(self, order: Tensor, number: int, size: int, generator: torch.Generator) -> Batch:
         """This process's share of the first ``size`` of a batch. Batches are whole ones: in a small last
@@ -190,6 +196,8 @@ class Trainer:
         rate = learning_rate(
             config.learning_rate, step, config.learning_rate_decay, config.least_learning_rate
         )
+        if config.warmup_steps:
+            rate *= min(1.0, (step + 1) / config.warmup_steps)
         return rate * cooldown(step, config.epochs * steps, config.cooldown_epochs * steps)
 
 

@@ -51,6 +51,8 @@ class MixtureWeights(BaseModel):
     """Of the distances of the proposals, beside those of the refined modes."""
     blind: float = Field(default=1.0, ge=0)
     """Of all terms of the blind forecast (CAB's λ)."""
+    blind_share: float = Field(default=1.0, gt=0, le=1)
+    """Share of a batch that is also forecast blindly."""
     apart: float = Field(default=0.1, ge=0)
     """λ_KL of CAB: how much full and blind latents are pressed apart."""
 
@@ -77,8 +79,10 @@ def mixture_objective(
     full = _terms(network, features, future, weights, Context.FULL)
     if not contrast:
         return Loss(full.value, full.named)
-    blind = _terms(network, features, future, weights, Context.BLIND)
-    apart = divergence(full.log_weights, blind.log_weights.detach())
+    some = slice(0, max(1, round(weights.blind_share * len(future))))
+    part = {name: values[some] for name, values in features.items()}
+    blind = _terms(network, part, future[some], weights, Context.BLIND)
+    apart = divergence(full.log_weights[some], blind.log_weights.detach())
     value = full.value + weights.blind * blind.value - weights.apart * apart
     named = {
         f"{name}_{which}": term

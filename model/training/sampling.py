@@ -7,7 +7,14 @@ CURVED_RADIANS = 0.35
 """rad; a path that turns more than that in its window counts as curved."""
 
 
-def epoch_order(turned: Tensor, curved_copies: int, seed: int, epoch: int) -> Tensor:
+def epoch_order(
+    turned: Tensor,
+    curved_copies: int,
+    seed: int,
+    epoch: int,
+    leaving: Tensor | None = None,
+    leaving_share: float = 1.0,
+) -> Tensor:
     """Indices of the pairs in the epoch's order; pairs of curved paths come several times.
 
     Most paths are straight, and a network that never turns is right about them.
@@ -17,11 +24,17 @@ def epoch_order(turned: Tensor, curved_copies: int, seed: int, epoch: int) -> Te
         curved_copies: how often a curved one comes.
         seed: of the run.
         epoch: counted from 0; each has its own order.
+        leaving: [P] bool, pairs that stood and leave; None: there are none.
+        leaving_share: how many of these the epoch shows, drawn anew for each.
     """
+    generator = torch.Generator().manual_seed(epoch_seed(seed, epoch))
     indices = torch.arange(len(turned))
     curved = indices[turned.abs() > CURVED_RADIANS]
     shown = torch.cat([indices, curved.repeat(curved_copies - 1)])
-    generator = torch.Generator().manual_seed(epoch_seed(seed, epoch))
+    if leaving is not None and leaving_share < 1:
+        some = shown[leaving[shown]]
+        kept = some[torch.randperm(len(some), generator=generator)[: int(leaving_share * len(some))]]
+        shown = torch.cat([shown[~leaving[shown]], kept])
     return shown[torch.randperm(len(shown), generator=generator)]
 
 

@@ -20,6 +20,11 @@ class BatchSource(Interface):
         ...
 
     @property
+    def leaving(self) -> Tensor:
+        """[P] bool, pairs that stood for the whole history and leave within 3 s; on the CPU."""
+        ...
+
+    @property
     def paths(self) -> Tensor:
         """[P, T, 2], m, each pair's future in its agent's own frame: x ahead, y to the left; on the CPU."""
         ...

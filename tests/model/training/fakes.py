@@ -30,6 +30,11 @@ class MadeUpPairs:
         return self._turned
 
     @property
+    def leaving(self) -> Tensor:
+        """[P], none."""
+        return torch.zeros(len(self), dtype=torch.bool)
+
+    @property
     def paths(self) -> Tensor:
         """[P, 12, 2], the futures in the agents' own frames."""
         return turned(self._future, -present_heading(self._features))
