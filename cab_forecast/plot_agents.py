@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Ellipse, Polygon
 
 from cab.forecast.v1.prediction_service_pb2 import Agent
+from cab_forecast.courses import heading_now
 from cab_forecast.forecast import Forecast
 from cab_forecast.names import type_name
 from cab_forecast.plot_style import INK, NOMINAL_RADIUS, NOMINAL_SIZES, TYPE_COLORS, WRONG
@@ -18,8 +19,6 @@ ELLIPSE_SECONDS = (2.0, 4.0, 6.0)
 SMALLEST_WEIGHT = 0.05
 MOST_MODES = 5
 MODES_WITH_ELLIPSES = 2
-_STANDING = 0.2
-"""m between two observations below which their direction is noise."""
 
 _Floats = npt.NDArray[np.float64]
 
@@ -43,7 +42,7 @@ def draw_agent(axes: Axes, agent: Agent, *, wrong: bool, label: bool) -> None:
     now = track[-1]
     axes.plot(*track.T, color=color, linewidth=1.6, alpha=0.55, solid_capstyle="round", zorder=4)
     axes.plot(*track[:-1].T, ".", color=color, markersize=2.5, alpha=0.6, zorder=4)
-    size, heading = NOMINAL_SIZES.get(type_name(agent.type)), _heading(agent, track)
+    size, heading = NOMINAL_SIZES.get(type_name(agent.type)), heading_now(agent)
     outline: Circle | Polygon
     if size is None or heading is None:
         outline = Circle((now[0], now[1]), NOMINAL_RADIUS if size is None else size[1] / 2)
@@ -118,19 +117,6 @@ def _draw_spread(axes: Axes, mean: _Floats, covariance: _Floats, color: str, sha
     two_sigma.set(edgecolor=color, alpha=0.45 * share, linewidth=0.7, linestyle=(0, (4, 2)), zorder=3)
     axes.add_patch(one_sigma)
     axes.add_patch(two_sigma)
-
-
-def _heading(agent: Agent, track: _Floats) -> float | None:
-    """The last heading observed, else the direction of motion, else None; rad."""
-    last = agent.states[-1]
-    if last.HasField("heading"):
-        return last.heading
-    moved = np.hypot(*(track[-1] - track).T)
-    far = np.flatnonzero(moved >= _STANDING)
-    if not len(far):
-        return None
-    step = track[-1] - track[far[-1]]
-    return math.atan2(step[1], step[0])
 
 
 def _pointed_box(center: _Floats, heading: float, length: float, width: float) -> _Floats:

@@ -1,8 +1,12 @@
 """The table."""
 
 import io
+import re
 
+import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from rich.console import Console
 
 from cab.forecast.v1.consistency_service_pb2 import (
@@ -37,21 +41,63 @@ def test_says_everything() -> None:
     text = shown(response, request)
     assert "in 1 s" in text
     assert "in 3 s" in text
-    straight = next(line for line in text.splitlines() if line.startswith("car-straight"))
-    assert straight.split("  ")[0] == "car-straight"
-    for part in ("vehicle", "OK", "0.55 of 5", "17.0, -5.2", "37.0, -5.2", "67.0, -5.2", "4.9 × 1.9"):
-        assert part in straight
+    lines = text.splitlines()
+    row = next(number for number, line in enumerate(lines) if line.startswith("car-straight"))
+    assert [" ".join(line.split()) for line in lines[row : row + 4]] == [
+        "car-straight vehicle OK 55 % straight on 10.0, +0.0 30.0, +0.0 60.0, +0.0 4.9 × 1.9",
+        "20 % bears left 41° 10.0, +0.9 29.2, +6.2 54.3, +22.3 4.9 × 1.9",
+        "15 % bears right 41° 10.0, -0.9 29.2, -6.2 54.3, -22.3 4.9 × 1.9",
+        "10 % other ways",
+    ]
     assert "truck-behind: FALLBACK by kalman@2.0.0: [this] type is not known" in text
     assert "[bad]: INVALID: agents[0].states: one state is too few" in text
     assert "model fan@1.0.0 · protocol causal · queue 0.2 ms · inference 3.1 ms · batch of 11 agents" in text
     assert "warning: figures of a fan, not of a model" in text
 
 
-def test_without_the_request_there_are_no_types() -> None:
-    assert "vehicle" not in shown(answer(demo_request()))
+def test_without_the_request_positions_are_those_of_the_ground_frame() -> None:
+    text = shown(answer(demo_request()))
+    assert "vehicle" not in text
+    assert "straight on" not in text
+    (straight,) = (line for line in text.splitlines() if line.startswith("car-straight"))
+    assert " ".join(straight.split()) == "car-straight OK 55 % 17.0, -5.2 37.0, -5.2 67.0, -5.2 4.9 × 1.9"
+    assert sum("10 %" in line and "other ways" in line for line in text.splitlines()) == 11
 
 
-@pytest.mark.parametrize(("width", "first"), [(120, True), (82, False), (20, False)])
+def test_an_agent_that_looks_nowhere_has_no_ahead() -> None:
+    request = demo_request()
+    parked = next(agent for agent in request.agents if agent.id == "car-parked")
+    for state in parked.states:
+        state.ClearField("heading")
+    (line,) = (line for line in shown(answer(request), request).splitlines() if line.startswith("car-parked"))
+    assert " ".join(line.split()) == (
+        "car-parked vehicle OK 55 % heading unknown: x, y 34.0, -8.2 34.0, -8.2 34.0, -8.2 0.1 × 0.1"
+    )
+
+
+@settings(deadline=None)
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=6).filter(lambda drawn: sum(drawn) > 0.01), st.data())
+def test_percents_sum_to_a_hundred(drawn: list[float], data: st.DataObject) -> None:
+    """Whatever part of the modes was returned."""
+    request = demo_request()
+    del request.agents[1:]
+    response = answer(request)
+    (forecast,) = response.forecasts
+    weights = np.array(drawn) / sum(drawn)
+    returned = data.draw(st.integers(1, len(weights)))
+    forecast.weights[:] = weights[:returned].tolist()
+    forecast.remaining_weight = float(weights[returned:].sum())
+    forecast.mode_ids[:] = range(returned)
+    forecast.most_likely_mode = int(weights[:returned].argmax())
+    forecast.means[:] = [*forecast.means[:24]] * returned
+    forecast.covariances[:] = [*forecast.covariances[:36]] * returned
+    percents = [int(found) for found in re.findall(r"(\d+) %", shown(response, request))]
+    assert sum(percents) == 100
+    assert len(percents) <= 4
+    assert abs(percents[0] - 100 * weights[:returned].max()) < 1
+
+
+@pytest.mark.parametrize(("width", "first"), [(120, True), (92, False), (20, False)])
 def test_a_narrow_terminal_gets_fewer_horizons(width: int, first: bool) -> None:
     request = demo_request()
     text = shown(answer(request), request, width)

@@ -110,6 +110,33 @@ async def test_merged_modes() -> None:
         assert list(forecast.samples) == list(unmerged.samples)
 
 
+async def test_merging_changes_nothing_that_is_remembered_or_counted() -> None:
+    """The agent drives by the mode of 1.1 times its stated speed, which merging leaves out of the answer."""
+    layers = np.ones((3, 40, 8), dtype=np.uint8)
+    told, off_road = [], []
+    for merge in (False, True):
+        metrics = Metrics()
+        plane = DataPlane(settings(default_model="fake"), metrics)
+        await plane.open(lambda: registry(FakeForecaster()))
+        for tick in range(16):
+            request = pb.PredictRequest(time=NOW + 0.5 * tick, scene_id="s")
+            request.options.consistency, request.options.merge = True, merge
+            agent = add_agent(request, x=2.75 * tick, speed=5.5)
+            for state in agent.states:
+                state.velocity_x, state.velocity_y = 5.0, 0.0
+            raster = request.scene_raster
+            raster.rows, raster.columns, raster.image.packed_bits = 40, 8, pack(layers)
+            raster.origin_x, raster.origin_y, raster.pixels_per_meter = -20.0, -4.0, 1.0
+            [forecast] = (await plane.predict(request)).forecasts
+        await plane.close()
+        told.append(forecast.consistency)
+        off_road.append(metrics.off_road.labels("fake")._value.get())
+    assert told[0].complete
+    assert told[0].errors[-1].displacement_error == pytest.approx(6.0, abs=1e-3)
+    assert told[0] == told[1]
+    assert off_road[0] == off_road[1] > 10
+
+
 async def test_of_merged_modes_the_likeliest_are_returned() -> None:
     response = await predict(make_request(1, merge=True, max_modes=1), FakeForecaster())
     [forecast] = response.forecasts
