@@ -19,7 +19,7 @@ from model.forecaster import Context, Features, Forecaster, ModelInfo, Protocol
 from model.mixture import TrajectoryMixture
 from model.scene import AgentType, Scene
 from model.single import require_observed, single_mode, step_times
-from model.uncertainty import Spread, aligned_covariance
+from model.uncertainty import SpreadBySpeed, aligned_covariance
 
 STANDING_SPEED = 1e-6
 """m/s; up to it the velocity has no direction, and the agent would set off along its heading."""
@@ -41,10 +41,12 @@ class Physics(Forecaster):
         name: of the model.
         accelerates: whether the acceleration goes on; else the speed stays.
         turns: whether the heading rate goes on; else the direction stays.
-        spread: how the error grows, by agent type.
+        spread: how the error grows, by agent type and speed.
     """
 
-    def __init__(self, name: str, accelerates: bool, turns: bool, spread: Mapping[AgentType, Spread]) -> None:
+    def __init__(
+        self, name: str, accelerates: bool, turns: bool, spread: Mapping[AgentType, SpreadBySpeed]
+    ) -> None:
         self._accelerates = accelerates
         self._turns = turns
         self._spread = spread
@@ -62,7 +64,7 @@ class Physics(Forecaster):
             uses_map=False,
             uses_neighbors=False,
             supports_blind=True,
-            trained_on="covariance only: nuScenes prediction train (vehicles), v1.0-mini (pedestrians)",
+            trained_on="covariance only: nuScenes prediction train (moving vehicles), v1.0-mini (the others)",
             license="Apache-2.0",
         )
 
@@ -112,7 +114,7 @@ class Physics(Forecaster):
         offset = _rotate(_travel(speed[:, None], acceleration[:, None], moving, turned), course[:, None])
 
         axis = torch.where((speed < HEADING_SPEED) & known, heading, course)
-        covariance = aligned_covariance(self._spread[agent_type], time, axis[:, None] + turned)
+        covariance = aligned_covariance(self._spread[agent_type], speed, time, axis[:, None] + turned)
         return single_mode(offset, covariance, features["position"])
 
 

@@ -95,6 +95,24 @@ def test_scenes_with_histories_of_different_length_are_joined() -> None:
         torch.testing.assert_close(joint.covariances[n], alone.covariances[0])
 
 
+def test_a_parked_car_mostly_stays() -> None:
+    still = np.zeros((5, 2))
+    deviation = [
+        KALMAN(tracks([still], 5), NOW).covariances[0, 0, step, 0, 0].sqrt().item() for step in (1, 11)
+    ]
+    assert 0.05 < deviation[0] < 0.2
+    assert 0.7 < deviation[1] < 1.2
+    cyclist = KALMAN(tracks([still], 5, AgentType.CYCLIST), NOW).covariances[0, 0, 11, 0, 0].sqrt().item()
+    moving = (
+        KALMAN(tracks([np.arange(10).reshape(5, 2) * 2.0], 5), NOW).covariances[0, 0, 11, 0, 0].sqrt().item()
+    )
+    assert cyclist == pytest.approx(moving)
+    assert 8 < moving < 11
+    # Who has just stopped does not stand yet: the filter goes on believing in much acceleration
+    stopped = np.array([[-6.0, 0], [-3, 0], [-1, 0], [0, 0], [0, 0]])
+    assert KALMAN(tracks([stopped], 5), NOW).covariances[0, 0, 11, 0, 0].sqrt().item() > 8
+
+
 def test_more_history_means_less_uncertainty() -> None:
     path = np.arange(10).reshape(5, 2) * 0.5
     ends = [KALMAN(tracks([path[-n:]], 5), NOW).covariances[0, 0, -1, 0, 0].item() for n in (2, 3, 4, 5)]

@@ -10,7 +10,7 @@ from model.forecaster import Context, Protocol, agent_count, join
 from model.mixture import TrajectoryMixture
 from model.physics import Physics, baselines
 from model.scene import AgentStates, AgentType, Scene
-from model.uncertainty import Growth, Spread, aligned_covariance, ellipse_radius
+from model.uncertainty import Growth, Spread, SpreadBySpeed, aligned_covariance, ellipse_radius
 from tests.model.scenes import present
 
 TIMES = 0.5 * np.arange(1, 13)
@@ -200,9 +200,56 @@ def test_growth_law() -> None:
     growth = Growth(position=0.3, velocity=0.4, acceleration=0.5)
     time = torch.tensor([0.0, 2.0], dtype=torch.float64)
     np.testing.assert_allclose(growth.variance(time), [0.09, 0.09 + 0.64 + 1.0])
-    spread = Spread(along=growth, across=Growth(0.1, 0.0, 0.0))
-    covariance = aligned_covariance(spread, time[1:], torch.tensor([[np.pi / 2]], dtype=torch.float64))
+    spread = SpreadBySpeed((0.0,), (Spread(along=growth, across=Growth(0.1, 0.0, 0.0)),))
+    speed = torch.tensor([5.0], dtype=torch.float64)
+    north = torch.tensor([[np.pi / 2]], dtype=torch.float64)
+    covariance = aligned_covariance(spread, speed, time[1:], north)
     np.testing.assert_allclose(covariance[0, 0], [[0.01, 0], [0, 1.73]], atol=1e-9)
+
+
+def test_growth_changes_linearly_with_the_speed() -> None:
+    def both(value: float) -> Spread:
+        return Spread(along=Growth(value, 0.0, 0.0), across=Growth(0.0, 2 * value, 0.0))
+
+    spread = SpreadBySpeed((1.0, 3.0, 4.0), (both(1.0), both(2.0), both(6.0)))
+    speed = torch.tensor([0.0, 1.0, 2.0, 3.0, 3.5, 4.0, 50.0], dtype=torch.float64)
+    along, across = spread.variances(speed, torch.tensor([0.5, 1.0], dtype=torch.float64))
+    expected = np.array([1.0, 1.0, 1.5, 2.0, 4.0, 6.0, 6.0])
+    np.testing.assert_allclose(along.sqrt(), np.tile(expected[:, None], (1, 2)))
+    np.testing.assert_allclose(across.sqrt(), expected[:, None] * [1.0, 2.0])
+
+
+def _sigma(name: str, speed: float, kind: AgentType = AgentType.VEHICLE) -> tuple[float, float]:
+    """σ along and across at 6 s, m, of who drives along x."""
+    covariance = BY_NAME[name](present(velocity=(speed, 0.0), heading=0.0, kind=kind), NOW).covariances[
+        0, 0, -1
+    ]
+    return float(covariance[0, 0].sqrt()), float(covariance[1, 1].sqrt())
+
+
+@pytest.mark.parametrize("name", BY_NAME)
+def test_a_standing_car_mostly_stays(name: str) -> None:
+    along, across = _sigma(name, 0.0)
+    assert 0.8 < along < 1.8
+    assert 0.25 < across < 0.5
+    # So does one whose velocity is a detector's noise
+    along, across = _sigma(name, 0.05)
+    assert along < 3
+    assert across < 2.5
+
+
+@pytest.mark.parametrize("name", BY_NAME)
+def test_a_driving_car_may_do_much(name: str) -> None:
+    for speed in (1.0, 3.0, 6.0, 12.0, 40.0):
+        along, across = _sigma(name, speed)
+        assert 10 < along < 50
+        assert 4 < across < 12
+    assert _sigma(name, 12.0) == _sigma(name, 40.0)
+
+
+def test_only_the_widths_of_vehicles_depend_on_the_speed() -> None:
+    for kind in (AgentType.PEDESTRIAN, AgentType.CYCLIST, AgentType.UNKNOWN):
+        assert _sigma("constant-velocity-yaw", 0.0, kind) == _sigma("constant-velocity-yaw", 5.0, kind)
 
 
 def test_ellipse_radius_holds_its_share() -> None:
