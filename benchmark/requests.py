@@ -11,8 +11,9 @@ from model.forecaster import Protocol
 from model.observations import Observations
 from model.scene import STEP_SECONDS, Raster
 
-REACH_M = 40.0
-"""m around an agent that are sent of the map; a patch reaches 34.3 m."""
+REACH_M = 74.0
+"""m around an agent that are sent of the map; a far patch reaches 71 m, and where recorded rasters end, 75 m
+beyond the tracks, tells where nobody goes."""
 
 
 class SceneRequests:
@@ -72,8 +73,8 @@ class SceneRequests:
 def crop(raster: Raster, around: Floats) -> SceneRaster:
     """The part of a map that some agents can see, on the same pixels.
 
-    Off the map it is one empty pixel: beyond its edge nothing is driveable, while of no map at all a model
-    would know nothing.
+    Off the map it is one empty pixel: for models of the ground frame nothing is driveable beyond its edge,
+    while of no map at all they would know nothing.
 
     Args:
         raster: of the scene.

@@ -105,6 +105,10 @@ class Forecaster(ABC):
         """Whether forecasts of agents of that type depend on the map."""
         return self.info.uses_map
 
+    def looks_far(self, agent_type: AgentType) -> bool:
+        """Whether forecasts of agents of that type depend on a far map patch, too."""
+        return False
+
     def __call__(
         self, scene: Scene, targets: Ints, context: Context = Context.FULL, steps: int | None = None
     ) -> TrajectoryMixture:

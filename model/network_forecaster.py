@@ -12,7 +12,7 @@ from model.arrays import Ints
 from model.forecaster import Context, Features, Forecaster, ModelInfo
 from model.inputs import network_features
 from model.mixture import TrajectoryMixture
-from model.networks.config import AnyNetworkConfig
+from model.networks.config import AnyNetworkConfig, NetworkConfig
 from model.scene import AgentType, Scene
 from model.single import require_observed
 
@@ -77,6 +77,10 @@ class NetworkForecaster(Forecaster, Generic[SomeNetworks]):
     def looks_at_map(self, agent_type: AgentType) -> bool:
         """Vehicles only, if at all."""
         return self.config.looks_at_map(agent_type)
+
+    def looks_far(self, agent_type: AgentType) -> bool:
+        """Vehicles only, in the agent's frame."""
+        return self.looks_at_map(agent_type) and isinstance(self.config, NetworkConfig) and self.config.far_map
 
     def prepare(self, scene: Scene, targets: Ints, context: Context = Context.FULL) -> Features:
         agent_type = scene.types[int(targets[0])]

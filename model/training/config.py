@@ -127,7 +127,7 @@ class TrainingConfig(BaseModel):
 
     @model_validator(mode="after")
     def _frame_fits_settings(self) -> "TrainingConfig":
-        if not self.in_agent_frame and (self.variants or self.hide or "mixture" in self.model_fields_set):
+        if not self.in_agent_frame and (self.variants or self.hide or self.mixture != MixtureWeights()):
             raise ValueError("variants, hide and mixture are for networks of frame agent")
         if self.in_agent_frame and self.rotate:
             raise ValueError("rotate: turning the ground frame changes nothing for a network of frame agent")
