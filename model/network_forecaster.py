@@ -80,7 +80,9 @@ class NetworkForecaster(Forecaster, Generic[SomeNetworks]):
 
     def looks_far(self, agent_type: AgentType) -> bool:
         """Vehicles only, in the agent's frame."""
-        return self.looks_at_map(agent_type) and isinstance(self.config, NetworkConfig) and self.config.far_map
+        return (
+            self.looks_at_map(agent_type) and isinstance(self.config, NetworkConfig) and self.config.far_map
+        )
 
     def prepare(self, scene: Scene, targets: Ints, context: Context = Context.FULL) -> Features:
         agent_type = scene.types[int(targets[0])]

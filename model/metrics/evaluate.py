@@ -39,6 +39,10 @@ MOVING_FIGURES: Final = (
 )
 """The figures that are told without the agents that stood, too."""
 
+LEAVING_M: Final = 2.0
+LEAVING_STEP: Final = 6
+"""A mode leaves that is more than 2 m away after 3 s: of standing agents hardly any should."""
+
 _CHUNK_POINTS: Final = 1 << 18
 """Sampled positions looked at at once."""
 
@@ -64,6 +68,7 @@ def instance_metrics(
       the likeliest; for k in 5, 10 ``merged_min_ade_{k}_m``, ``merged_min_fde_{k}_m``,
       ``merged_miss_rate_{k}`` and ``merged_brier_min_fde_{k}_m``; ``merged_modes_90``: how many hold 90 % of
       the probability; ``merged_first_weight``: of the likeliest. Everything else is of the modes as they are.
+    - ``leaving_weight_3s``: probability of the modes that are more than ``LEAVING_M`` from now after 3 s.
     - ``nll``: nats, mean over the steps; ``nll_{h}s``: at that step; ``nll_joint``: whole trajectory. Of the
       labelled position: the mixture is widened by ``noise_m`` (see ``density``).
     - with rasters: ``off_road_ml``: 1 or 0, the most likely trajectory; NaN without a map.
@@ -114,6 +119,9 @@ def instance_metrics(
         result[f"min_fde_{k}_m"] = multimodal.min_fde_m(modes, probabilities, truth, k)
         result[f"miss_rate_{k}"] = multimodal.missed(modes, probabilities, truth, k)
     result |= _merged(mixture, truth)
+    if steps >= LEAVING_STEP:
+        leaving = mixture.means[:, :, LEAVING_STEP - 1].norm(dim=-1) > LEAVING_M
+        result["leaving_weight_3s"] = (mixture.weights.double() * leaving).sum(dim=1).numpy()
     result |= _likelihood(mixture, truth, noise_m)
     if rasters is not None:
         result["off_road_ml"] = offroad.off_road_of_each(rasters, most_likely)

@@ -20,6 +20,7 @@ ALWAYS = {
     "merged_miss_rate_10",
     "merged_modes_90",
     "merged_first_weight",
+    "leaving_weight_3s",
     "nll",
     "nll_joint",
 }
@@ -91,7 +92,11 @@ def test_a_certain_forecast_that_is_right() -> None:
     m = certain(random_mixture(3, modes=1))
     got = instance_metrics(m, m.most_likely_trajectory().numpy(), [ROAD] * 3, SEEDS, samples=7)
     for name, values in got.items():
-        if name.startswith("inside") or name in ("merged_modes_90", "merged_first_weight"):
+        if name.startswith("inside") or name in (
+            "merged_modes_90",
+            "merged_first_weight",
+            "leaving_weight_3s",
+        ):
             assert (values == 1).all(), name
         elif not name.startswith("nll"):
             np.testing.assert_allclose(values, 0, atol=1e-12, err_msg=name)
@@ -182,3 +187,15 @@ def test_sizes_must_fit() -> None:
             instance_metrics(*arguments)
     with pytest.raises(ValueError, match="rasters"):
         instance_metrics(m, truth, [ROAD])
+
+
+def test_weight_that_leaves_is_that_of_modes_beyond_two_metres_after_three_seconds() -> None:
+    means = torch.zeros(1, 3, 12, 2)
+    means[0, 1, 5, 0], means[0, 2, 5, 1] = 1.99, -2.01
+    means[0, 0, 6:] = 50.0  # later than 3 s does not count
+    weights = torch.tensor([[0.5, 0.3, 0.2]])
+    mixture = TrajectoryMixture(
+        weights.log(), means, torch.eye(2).expand(1, 3, 12, 2, 2), torch.full((1, 2), 7.0).double()
+    )
+    leaving = instance_metrics(mixture, np.zeros((1, 12, 2)))["leaving_weight_3s"]
+    np.testing.assert_allclose(leaving, [0.2], atol=1e-6)
