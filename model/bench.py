@@ -13,14 +13,16 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from model.agent_features import NEIGHBOR_FEATURES, NEIGHBORS
 from model.cvae import CvaeForecaster, CvaeNetworks
 from model.forecaster import Context, Features, ModelInfo, Protocol
-from model.networks.config import BlindContext, NetworkConfig
+from model.networks.config import BlindContext, Frame, NetworkConfig
 from model.scene import AgentType
 
 AGENTS = (1, 8, 32, 128)
-FLOP_PER_AGENT = 42e6
-"""Multiplications and additions of the full forward, K = 25, T = 12 (REFERENCE, section 2)."""
+FLOP_PER_AGENT = {Frame.GROUND: 42e6, Frame.AGENT: 25e6}
+"""Multiplications and additions of the full forward, K = 25, T = 12: of the published network with its GRU
+unrolled (REFERENCE, section 2), and of the one in the agent's frame."""
 HISTORY_FRAMES = 5
 _SECONDS_EACH = 2.0
 _LEAST_CALLS = 11
@@ -42,10 +44,10 @@ def paired_seconds(*calls: Callable[[], object], seconds: float = _SECONDS_EACH)
     return [median(own[len(own) // 11 :]) for own in times]
 
 
-def cab_network() -> CvaeForecaster:
-    """A CAB network for vehicles with seeded random weights: speed does not hang on their values."""
+def cab_network(frame: Frame = Frame.GROUND) -> CvaeForecaster:
+    """Return a CAB network for vehicles with seeded random weights: speed does not hang on their values."""
     torch.manual_seed(0)
-    config = NetworkConfig(blind=BlindContext.NULL)
+    config = NetworkConfig(blind=BlindContext.NULL, frame=frame, far_map=frame is Frame.AGENT)
     info = ModelInfo(
         name="cab",
         version="0",
@@ -82,30 +84,56 @@ def features(agents: int) -> Features:
     }
 
 
+def features_in_agent_frame(agents: int) -> Features:
+    """Return random features of that many vehicles for a network in the agent's frame."""
+    generator = torch.Generator().manual_seed(agents)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(agents, *shape, generator=generator)
+
+    neighbors = normal(NEIGHBORS, NEIGHBOR_FEATURES)
+    neighbors[..., -1] = 1.0
+    return {
+        "origin": normal(2).double(),
+        "heading": normal(1)[:, 0].double(),
+        "speed": 5 * normal(1)[:, 0].abs(),
+        "history": normal(HISTORY_FRAMES, 8),
+        "first": torch.zeros(agents, dtype=torch.long),
+        "neighbors": neighbors,
+        "map": (normal(3, 100, 100) > 0).float() * 2 - 1,
+        "far_map": (normal(3, 100, 100) > 0).float() * 2 - 1,
+    }
+
+
 def main() -> None:
-    """Prints the table."""
-    model = cab_network()
+    """Print the table: both networks in turns, so that what else the machine does meets them alike."""
+    models = {frame: cab_network(frame) for frame in Frame}
+    model = models[Frame.GROUND]
     left, right = torch.randn(_MATRIX, _MATRIX), torch.randn(_MATRIX, _MATRIX)
     table = Table(
-        title=f"full forward, K = {model.info.modes}, T = {model.info.steps}, "
-        f"{FLOP_PER_AGENT / 1e6:.0f} MFLOP an agent; {torch.get_num_threads()} threads, "
-        f"torch {torch.__version__}, {platform.machine()}"
+        title=f"full forward, K = {model.info.modes}, T = {model.info.steps}; "
+        f"{torch.get_num_threads()} threads, torch {torch.__version__}, {platform.machine()}"
     )
-    for heading in ("vehicles", "ms", "agents/s", "fp32 matmul, GFLOP/s", "share of matmul rate"):
-        table.add_column(heading, justify="right")
+    for column in ("vehicles", "frame", "ms", "agents/s", "fp32 matmul, GFLOP/s", "share of matmul rate"):
+        table.add_column(column, justify="right")
     for agents in AGENTS:
-        batch = features(agents)
-        forward = partial(model.forecast, batch, AgentType.VEHICLE, Context.FULL)
-        seconds, product = paired_seconds(forward, partial(torch.matmul, left, right))
+        batches = {Frame.GROUND: features(agents), Frame.AGENT: features_in_agent_frame(agents)}
+        forwards = [
+            partial(models[frame].forecast, batches[frame], AgentType.VEHICLE, Context.FULL)
+            for frame in Frame
+        ]
+        *seconds, product = paired_seconds(*forwards, partial(torch.matmul, left, right))
         rate = 2 * _MATRIX**3 / product
-        share = agents * FLOP_PER_AGENT / seconds / rate
-        table.add_row(
-            str(agents),
-            f"{1e3 * seconds:.1f}",
-            f"{agents / seconds:.0f}",
-            f"{rate / 1e9:.0f}",
-            f"{share:.2f}",
-        )
+        for frame, one in zip(Frame, seconds, strict=True):
+            share = agents * FLOP_PER_AGENT[frame] / one / rate
+            table.add_row(
+                str(agents),
+                frame.value,
+                f"{1e3 * one:.1f}",
+                f"{agents / one:.0f}",
+                f"{rate / 1e9:.0f}",
+                f"{share:.2f}",
+            )
     Console().print(table)
 
 
