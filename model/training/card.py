@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from model.forecaster import Protocol
+from model.networks.config import NetworkConfig
 from model.training.calibration import AnyCalibration, HorizonCalibration
 from model.training.config import TrainingConfig
 from model.training.state import Progress
@@ -58,9 +59,8 @@ def model_card(
 - **Protocol**: {inputs[origin.protocol]}.
 - **Forecasts** vehicles, 6 s ahead at 2 Hz, as {config.network.modes} modes; uses up to
   {config.history_frames} frames of history.
-- **Begun** with {config.start or "random parameters"}.
-- **Training**: best of {progress.epoch} epochs (epoch {progress.best_epoch}; settings ask for
-  {config.epochs}), batches of {config.batch_size}, learning rate {config.learning_rate:g},
+{_network(config)}- **Begun** with {config.start or "random parameters"}.
+- **Training**: epoch {progress.best_epoch} of {progress.epoch} (settings ask for {config.epochs}), batches of {config.batch_size}, learning rate {config.learning_rate:g},
   seed {config.seed}; {progress.seconds / 60:.0f} minutes on {origin.machine}.
 - **Calibration**: {_calibration(calibration)}.
 - **Command**: `{origin.command}`, with the settings below as SETTINGS.toml.
@@ -80,6 +80,25 @@ On {origin.reported}, {origin.protocol.value} protocol. {_choice(config, origin)
 {config.toml()}
 ```
 """
+
+
+def _network(config: TrainingConfig) -> str:
+    """Return what is not as in the published network; nothing where all is."""
+    network = config.network
+    if not (isinstance(network, NetworkConfig) and config.in_agent_frame):
+        return ""
+    parts = ["states and forecasts are in the agent's own frame (origin and heading)"]
+    if network.far_map:
+        parts.append("a second map patch reaches 61 m ahead and 36 m to the sides")
+    if network.neighbor_types:
+        parts.append("neighbours are attended to one by one")
+    read = ", and again after map and neighbours were read where they lead" if network.far_map else ""
+    parts += [
+        f"the controls of all steps of a mode are decoded at once{read} (no GRU is unrolled)",
+        "standard deviations along and across a path are outputs",
+        "p(z | x) is trained as the weights of the mixture, so there is no q(z | x, y)",
+    ]
+    return f"- **Differs from the published network**: {'; '.join(parts)}.\n"
 
 
 def _choice(config: TrainingConfig, origin: Origin) -> str:
