@@ -60,8 +60,9 @@ def model_card(
 - **Forecasts** vehicles, 6 s ahead at 2 Hz, as {config.network.modes} modes; uses up to
   {config.history_frames} frames of history.
 {_network(config)}- **Begun** with {config.start or "random parameters"}.
-- **Training**: epoch {progress.best_epoch} of {progress.epoch} (settings ask for {config.epochs}), batches of {config.batch_size}, learning rate {config.learning_rate:g},
-  seed {config.seed}; {progress.seconds / 60:.0f} minutes on {origin.machine}.
+- **Training**: epoch {progress.best_epoch} of {progress.epoch} (settings ask for {config.epochs}),
+  batches of {config.batch_size}, learning rate {config.learning_rate:g}, seed {config.seed};
+  {progress.seconds / 60:.0f} minutes on {origin.machine}.
 - **Calibration**: {_calibration(calibration)}.
 - **Command**: `{origin.command}`, with the settings below as SETTINGS.toml.
 - **Licence**: {LICENSE}.
