@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from model.networks.config import AnyNetworkConfig, CoverNetConfig
+from model.networks.config import AnyNetworkConfig, CoverNetConfig, Frame, NetworkConfig
 from model.training.mixture_objective import MixtureWeights
 from model.training.precision import Precision
 
@@ -39,6 +39,9 @@ class Method(StrEnum):
 
 BLIND = frozenset({Method.CAB, Method.REWEIGHT, Method.RUBIZ})
 """Methods whose objectives compare with a blind forecast."""
+
+_IN_AGENT_FRAME = frozenset({Method.CAB, Method.TRAJECTRON, Method.TRAJECTRON_NO_CONTEXT})
+"""Methods with networks of the agent's frame."""
 
 
 class TrainingConfig(BaseModel):
@@ -122,10 +125,26 @@ class TrainingConfig(BaseModel):
         return self
 
     @model_validator(mode="after")
+    def _suits_the_frame(self) -> "TrainingConfig":
+        if not self._in_agent_frame:
+            if self.variants or self.hide or self.mixture != MixtureWeights():
+                raise ValueError("variants, hide and mixture are for networks of the agent's frame")
+            return self
+        if self.method not in _IN_AGENT_FRAME:
+            raise ValueError(f"frame: {self.method.value} does not learn in the agent's frame")
+        if self.rotate:
+            raise ValueError("rotate: in the agent's frame a scene that is turned is the same scene")
+        return self
+
+    @model_validator(mode="after")
     def _cools_within_the_run(self) -> "TrainingConfig":
         if self.cooldown_epochs > self.epochs:
             raise ValueError(f"cooldown_epochs {self.cooldown_epochs} is more than epochs {self.epochs}")
         return self
+
+    @property
+    def _in_agent_frame(self) -> bool:
+        return isinstance(self.network, NetworkConfig) and self.network.frame is Frame.AGENT
 
     @property
     def epochs_apart(self) -> int:
@@ -134,11 +153,18 @@ class TrainingConfig(BaseModel):
 
     def toml(self) -> str:
         """The settings as a file for ``load_config``; what is given on the command line is left out."""
-        values = self.model_dump(mode="json", exclude={"method", "start"}, exclude_none=True)
-        network = values.pop("network")
-        # Strings, numbers, booleans and lists of them are written alike in JSON and TOML
-        lines = [f"{name} = {json.dumps(value)}" for name, value in values.items()]
-        return "\n".join([*lines, "", "[network]", *(f"{n} = {json.dumps(v)}" for n, v in network.items())])
+        left_out = {"method", "start"} if self._in_agent_frame else {"method", "start", "mixture"}
+        values = self.model_dump(mode="json", exclude=left_out, exclude_none=True)
+        tables = {name: values.pop(name) for name in ("mixture", "network") if name in values}
+        lines = _toml_lines(values)
+        for name, table in tables.items():
+            lines += ["", f"[{name}]", *_toml_lines(table)]
+        return "\n".join(lines)
+
+
+def _toml_lines(values: Mapping[str, Any]) -> list[str]:
+    """Return assignments; strings, numbers, booleans and lists of them are written alike in JSON and TOML."""
+    return [f"{name} = {json.dumps(value)}" for name, value in values.items()]
 
 
 def parse_method(name: str) -> Method:
