@@ -56,7 +56,8 @@ def cut_patches(
 ) -> Float32s:
     """Return map patches of N agents, bilinear between raster pixels.
 
-    A raster of twice the patch's resolution or more is first brought near it, so that thin lines stay.
+    A raster of twice the patch's resolution or more is first brought near it, so that thin lines stay. Its
+    pixels are joined as the raster counts them: a patch does not hang on whose else are cut with it.
 
     Positions are taken relative to the raster's origin in float64 and used to the fraction of a pixel.
 
@@ -89,6 +90,7 @@ def cut_patches(
     low = np.maximum(np.floor(center[on_map].min(axis=0) - reach), 0).astype(np.int64)
     high = np.minimum(np.ceil(center[on_map].max(axis=0) + reach) + 1, [rows, columns]).astype(np.int64)
     factor = max(int(zoom), 1)
+    low -= low % factor
     pixels = _coarsened(raster.layers[:, low[0] : high[0], low[1] : high[1]], factor)
     if outside:  # one layer more, which tells how much of a sample lies on the raster
         pixels = np.concatenate([pixels, np.ones_like(pixels[:1])])

@@ -34,7 +34,8 @@ class Batches:
         """
         Args:
             cache: the pairs.
-            device: where batches are made and stay; on a GPU all of the cache is copied there.
+            device: where batches are made and stay; on a GPU all of the cache is copied there but for map
+                patches of the agents' frames.
             config: what the network looks at, for a network that sees less than is there; None: all.
             packed_maps: leave map patches of the agent's frame packed, three layers a byte: augmentation
                 then moves a twelfth of the memory, and ``packing.unpack_patches`` is the caller's.
@@ -67,7 +68,7 @@ class Batches:
             del arrays["velocity"]
             if wanted:
                 arrays["neighbors"] = cache.agents
-            self._packed = _packed_patches(cache, config, device)
+            self._packed = _packed_patches(cache, config)
         elif wanted and cache.surroundings is not None:
             arrays["surroundings"] = cache.surroundings
         elif wanted:
@@ -76,8 +77,10 @@ class Batches:
         # The arrays are small: in memory, a batch costs no page faults
         self._arrays = {name: torch.from_numpy(np.array(array)).to(device) for name, array in arrays.items()}
         self._future = torch.from_numpy(np.array(cache.future)).to(device)
-        self._turned = torch.from_numpy(np.array(cache.turn))[:: 1 + key.variants]
-        paths = rotate_vectors(cache.future.astype(np.float64), -cache.heading[:, None])
+        self._turned = torch.from_numpy(np.array(cache.turn[:: 1 + key.variants]))
+        recorded = slice(None, None, 1 + key.variants)
+        future, heading = cache.future[recorded], cache.heading[recorded]
+        paths = rotate_vectors(future.astype(np.float64), -heading[:, None])
         self._paths = torch.from_numpy(paths.astype(np.float32))
         self._leaving = torch.from_numpy(_leaving(cache))[:: 1 + key.variants]
         looks = config is None or config.looks_at_map(AgentType.VEHICLE)
@@ -156,7 +159,7 @@ def _leaving(cache: Cache) -> Bools:
 _GROUND_SCALE = state_scale(AgentType.VEHICLE, AgentType.VEHICLE)
 
 
-def _packed_patches(cache: Cache, config: AnyNetworkConfig | None, device: torch.device) -> dict[str, Tensor]:
+def _packed_patches(cache: Cache, config: AnyNetworkConfig | None) -> dict[str, Tensor]:
     """Return the packed map patches that a network of the agent's frame looks at, by feature."""
     near = config is None or config.uses_map
     far = config is None or (isinstance(config, NetworkConfig) and config.far_map)

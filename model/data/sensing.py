@@ -6,7 +6,7 @@ drawn from recorded tracks, and brought onto the grid by ``model.resample``, as 
 
 Between recorded poses an agent moves along a cubic Hermite spline. Its tangent now comes from the past alone
 (a parabola through the last three poses): a tangent from both sides would put the next position into the
-observations (REFERENCE: what the papers' inputs leak).
+observations, as the papers' inputs have it.
 """
 
 from dataclasses import dataclass, fields
@@ -86,6 +86,8 @@ class SensedFrames:
             variant: another one is another report.
         """
         scene, tracks = self._frames.at(frame)
+        if not len(tracks):
+            return scene, tracks
         random = np.random.default_rng([self._seed, frame, variant])
         time = frame * STEP_SECONDS
         observed = self._observe(tracks, frame, _Draw.of(random), random)
@@ -95,10 +97,10 @@ class SensedFrames:
         return Scene(scene.types, mixed, scene.raster), tracks
 
     def _observe(self, tracks: Ints, frame: int, draw: _Draw, random: np.random.Generator) -> Observations:
-        """Return the observations of some tracks up to a frame."""
+        """Return the observations of some tracks, one at least, up to a frame."""
         count = int(_SPAN_S * draw.rate_hz) + 1
         rows = [self._observe_one(int(track), frame, count, draw, random) for track in tracks.tolist()]
-        size = max((len(row.time) for row in rows), default=1)
+        size = max(len(row.time) for row in rows)
 
         def padded(values: list[Floats], fill: float) -> Floats:
             result = np.full((len(values), size, *values[0].shape[1:]), fill)

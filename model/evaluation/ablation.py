@@ -15,6 +15,9 @@ _NEIGHBORS = ("neighbors", "edge_mask", "surroundings")
 """Features that tell of them, up to the dot; zero means that there are none."""
 
 
+_MAPS = frozenset({"map", "far_map"})
+
+
 class Without(StrEnum):
     """What is taken away."""
 
@@ -27,9 +30,10 @@ def without_map(features: Features) -> Features:
     """The features with the null map.
 
     Args:
-        features: of ``model.inputs``; ``map`` [N, 3, 100, 100] in [-1, 1].
+        features: of ``model.inputs``; ``map`` and, where there is one, ``far_map`` [N, 3, 100, 100] in
+            [-1, 1].
     """
-    return features | {"map": torch.zeros_like(features["map"])}
+    return features | {name: torch.zeros_like(features[name]) for name in _MAPS & features.keys()}
 
 
 def without_neighbors(features: Features) -> Features:
@@ -37,7 +41,7 @@ def without_neighbors(features: Features) -> Features:
 
     Args:
         features: of ``model.inputs``; ``neighbors.<type>`` [N, F, D] and ``edge_mask`` [N], or
-            ``surroundings`` [N, S, 5].
+            ``neighbors`` [N, M, 11], or ``surroundings`` [N, S, 5].
     """
     gone = [name for name in features if name.partition(".")[0] in _NEIGHBORS]
     return features | {name: torch.zeros_like(features[name]) for name in gone}

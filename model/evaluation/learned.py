@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from model.data.cache_layout import CacheKey
+from model.data.cache_layout import CacheKey, in_agent_frame
 from model.data.caches import open_cache
 from model.data.checks import FUTURE_STEPS
 from model.data.scenes import Reader
@@ -85,7 +85,8 @@ def open_validations(
     shared: dict[CacheKey, tuple[AnyNetworkConfig, list[Learned]]] = {}
     for model in models:
         # What looks at no neighbours can share the cache of what does
-        config = model.config if model.config.neighbor_types else NetworkConfig()
+        shares = not (model.config.neighbor_types or in_agent_frame(model.config))
+        config = NetworkConfig() if shares else model.config
         made = CacheKey.of(reader, split, protocol, config, model.info.history_frames)
         shared.setdefault(made, (config, []))[1].append(model)
     for made, (config, group) in shared.items():

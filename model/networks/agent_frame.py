@@ -19,7 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from model.agent_features import NEIGHBOR_FEATURES
+from model.agent_features import NEIGHBOR_FEATURES, NEIGHBOR_POSITION_SCALE, NEIGHBOR_VELOCITY_SCALE
 from model.forecaster import Context, Features
 from model.networks.config import NetworkConfig
 from model.networks.dynamics import Positions
@@ -47,9 +47,9 @@ _MAX_SPEED_CORRECTION = 2.0
 """m/s; so is a velocity."""
 _READ_LATERAL_M = (-6.0, -3.5, -1.75, 0.0, 1.75, 3.5, 6.0)
 _READ_AHEAD_M = (0.0, 5.0)
-_READ_EVERY = 2
-"""Steps between those at which it is read."""
 """Where the map is read around each position of a mode, m, in the frame of the path there."""
+_READ_EVERY = 2
+"""Steps from one at which it is read to the next."""
 _NEAR_M, _WIDE_M = 2.5, 8.0
 """Widths of the bumps by which a mode feels how near it comes to a neighbour."""
 
@@ -283,7 +283,7 @@ class AgentFrameNetwork(nn.Module):
         """
         x, y, heading, speed = (part.detach()[..., _READ_EVERY - 1 :: _READ_EVERY] for part in path)
         where = torch.stack([x / 30, y / 30, heading, speed / 15], dim=-1)
-        read = self.read_state(where)
+        read: Tensor = self.read_state(where)
         if context is not Context.FULL:
             return F.relu(read, inplace=True)
         if self.read_map is not None:
@@ -316,7 +316,7 @@ def read_patch(patches: Tensor, x: Tensor, y: Tensor, geometry: PatchGeometry) -
     row = (x * geometry.pixels_per_meter + geometry.rows_behind + 0.5) * (2 / size) - 1
     column = (y * geometry.pixels_per_meter + geometry.columns_right + 0.5) * (2 / size) - 1
     grid = torch.stack([column, row], dim=-1).flatten(1, -2)[:, None]  # [N, 1, P, 2]
-    values = F.grid_sample(patches, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
+    values: Tensor = F.grid_sample(patches, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
     return values.unflatten(-1, x.shape[1:])[:, :, 0]
 
 
@@ -332,9 +332,9 @@ def _closeness(x: Tensor, y: Tensor, features: Features) -> Tensor:
     neighbors = features["neighbors"]
     steps = torch.arange(_READ_EVERY, STEPS + 1, _READ_EVERY, dtype=x.dtype, device=x.device)
     seconds = STEP_SECONDS * steps
-    place = (
-        30 * neighbors[:, :, None, 0:2] + 15 * neighbors[:, :, None, 4:6] * seconds[:, None]
-    )  # [N, M, T, 2]
+    position = NEIGHBOR_POSITION_SCALE * neighbors[:, :, None, 0:2]
+    velocity = NEIGHBOR_VELOCITY_SCALE * neighbors[:, :, None, 4:6]
+    place = position + velocity * seconds[:, None]  # [N, M, T, 2]
     squared = (x[:, None] - place[..., 0][:, :, None]).square() + (
         y[:, None] - place[..., 1][:, :, None]
     ).square()

@@ -3,7 +3,7 @@
 from enum import StrEnum
 from typing import Annotated, Any, Literal, TypeAlias
 
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, NonNegativeFloat, Tag, model_validator
 
 from model.scene import AgentType
 from model.standardization import STATE_SIZE
@@ -50,7 +50,7 @@ class NetworkConfig(BaseModel):
     """Frame of features and forecasts; checkpoints that do not say have the ground frame."""
     far_map: bool = False
     """Whether vehicles also look at a map patch that reaches as far as 6 s (agent frame only)."""
-    min_sigma_m: tuple[float, float] = (0.1, 0.3)
+    min_sigma_m: tuple[NonNegativeFloat, NonNegativeFloat] = (0.1, 0.3)
     """m, standard deviation that no direction of a forecast goes below, at 1 s and at 6 s, linear between
     (agent frame only)."""
     modes: int = Field(default=25, ge=1, le=255)

@@ -37,7 +37,10 @@ class HistoryLSTM(nn.Module):
         hidden = inputs.new_zeros(len(inputs), self.hidden_size)
         cell = hidden
         started = torch.arange(inputs.shape[1], device=inputs.device)[:, None] >= first  # [F, N]
-        everywhere = started.all(dim=1).tolist()
+        if torch.compiler.is_exporting():  # a graph cannot hang on values; the result is the same
+            everywhere = [False] * inputs.shape[1]
+        else:
+            everywhere = started.all(dim=1).tolist()
         for frame in range(inputs.shape[1]):
             gates = torch.addmm(gates_in[:, frame], hidden, self.weight_hh.T)
             keep, forget, new, out = gates.chunk(4, dim=1)

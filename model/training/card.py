@@ -19,7 +19,7 @@ class Origin:
     """The data set and its pairs, in words."""
     protocol: Protocol
     reported: str
-    """The split that the figures are of, in words."""
+    """The split that the figures are of, in words, and how many pairs it has, in brackets."""
     chosen_on: str
     """The split that the epoch was chosen on, and that a calibration by horizon was fitted to."""
     command: str
@@ -63,7 +63,7 @@ def model_card(
 - **Training**: epoch {progress.best_epoch} of {progress.epoch} (settings ask for {config.epochs}),
   batches of {config.batch_size}, learning rate {config.learning_rate:g}, seed {config.seed};
   {progress.seconds / 60:.0f} minutes on {origin.machine}.
-- **Calibration**: {_calibration(calibration)}.
+- **Calibration**: {_calibration(calibration, origin)}.
 - **Command**: `{origin.command}`, with the settings below as SETTINGS.toml.
 - **Licence**: {LICENSE}.
 
@@ -105,7 +105,7 @@ def _network(config: TrainingConfig) -> str:
 def _choice(config: TrainingConfig, origin: Origin) -> str:
     if config.keep == "last":
         return "The last epoch was kept, whatever its figures."
-    same = origin.reported.startswith(origin.chosen_on)
+    same = origin.reported.startswith(f"{origin.chosen_on} (")
     return (
         "The epoch was chosen by the FDE of the likeliest\nmode on "
         f"{'this same split' if same else origin.chosen_on}."
@@ -116,15 +116,16 @@ RAN_AWAY = "a number ran to the bound of its search: the likelihood asks for mor
 """Said of such a calibration, on the card and while training."""
 
 
-def _calibration(calibration: AnyCalibration | None) -> str:
+def _calibration(calibration: AnyCalibration | None, origin: Origin) -> str:
     if calibration is None:
         return "none, the forecasts are as sure of themselves as the method has them"
     if isinstance(calibration, HorizonCalibration):
         widths = ", ".join(f"{width:.2f}" for width in calibration.widths)
         return (
             f"standard deviations of the 12 steps times {widths}, logits of the modes divided by "
-            f"{calibration.temperature:.2f}, fitted after training to merged forecasts of held-out pairs, so "
-            f"that their positions are the likeliest{f'; {RAN_AWAY}' if calibration.ran_away else ''}"
+            f"{calibration.temperature:.2f}, fitted after training to merged forecasts of pairs of "
+            f"{origin.chosen_on}, so that their positions are the likeliest"
+            f"{f'; {RAN_AWAY}' if calibration.ran_away else ''}"
         )
     blind = calibration.blind_width
     of_blind = "" if blind is None else f" (of blind forecasts {blind:.3f})"

@@ -40,9 +40,8 @@ class Method(StrEnum):
 BLIND = frozenset({Method.CAB, Method.REWEIGHT, Method.RUBIZ})
 """Methods whose objectives compare with a blind forecast."""
 
-
-IN_AGENT_FRAME = frozenset({Method.CAB, Method.TRAJECTRON, Method.TRAJECTRON_NO_CONTEXT})
-"""Methods that can be trained in the agent's frame."""
+_IN_AGENT_FRAME = frozenset({Method.CAB, Method.TRAJECTRON, Method.TRAJECTRON_NO_CONTEXT})
+"""Methods with networks of the agent's frame."""
 
 
 class TrainingConfig(BaseModel):
@@ -126,19 +125,21 @@ class TrainingConfig(BaseModel):
         return self
 
     @model_validator(mode="after")
-    def _frame_fits_settings(self) -> "TrainingConfig":
-        if not self.in_agent_frame and (self.variants or self.hide or self.mixture != MixtureWeights()):
-            raise ValueError("variants, hide and mixture are for networks of frame agent")
-        if self.in_agent_frame and self.rotate:
-            raise ValueError("rotate: turning the ground frame changes nothing for a network of frame agent")
-        if self.in_agent_frame and self.method not in IN_AGENT_FRAME:
-            raise ValueError(f"{self.method.value} has no objective for networks of frame agent yet")
-        return self
-
-    @model_validator(mode="after")
     def _mirrors_what_is_covered(self) -> "TrainingConfig":
         if self.mirror and self.method is Method.COVERNET:
             raise ValueError("mirror: covernet's set of trajectories does not cover mirrored ones")
+        return self
+
+    @model_validator(mode="after")
+    def _suits_the_frame(self) -> "TrainingConfig":
+        if not self.in_agent_frame:
+            if self.variants or self.hide or self.mixture != MixtureWeights():
+                raise ValueError("variants, hide and mixture are for networks of the agent's frame")
+            return self
+        if self.method not in _IN_AGENT_FRAME:
+            raise ValueError(f"frame: {self.method.value} does not learn in the agent's frame")
+        if self.rotate:
+            raise ValueError("rotate: in the agent's frame a scene that is turned is the same scene")
         return self
 
     @model_validator(mode="after")
@@ -148,30 +149,28 @@ class TrainingConfig(BaseModel):
         return self
 
     @property
+    def in_agent_frame(self) -> bool:
+        return isinstance(self.network, NetworkConfig) and self.network.frame is Frame.AGENT
+
+    @property
     def epochs_apart(self) -> int:
         """Epochs without the displacement: see ``displacement_after``."""
         return 0 if self.start is not None else min(self.displacement_after, self.epochs // 2)
 
     def toml(self) -> str:
         """The settings as a file for ``load_config``; what is given on the command line is left out."""
-        values = self.model_dump(mode="json", exclude={"method", "start"}, exclude_none=True)
-        tables = {"mixture": values.pop("mixture"), "network": values.pop("network")}
-        if not self.in_agent_frame:
-            del tables["mixture"]
-        # Strings, numbers, booleans and lists of them are written alike in JSON and TOML
-        lines = [f"{name} = {json.dumps(value)}" for name, value in values.items()]
-        for table, settings in tables.items():
-            lines += [
-                "",
-                f"[{table}]",
-                *(f"{name} = {json.dumps(value)}" for name, value in settings.items()),
-            ]
+        left_out = {"method", "start"} if self.in_agent_frame else {"method", "start", "mixture"}
+        values = self.model_dump(mode="json", exclude=left_out, exclude_none=True)
+        tables = {name: values.pop(name) for name in ("mixture", "network") if name in values}
+        lines = _toml_lines(values)
+        for name, table in tables.items():
+            lines += ["", f"[{name}]", *_toml_lines(table)]
         return "\n".join(lines)
 
-    @property
-    def in_agent_frame(self) -> bool:
-        """Whether the network sees and forecasts in the agent's frame."""
-        return isinstance(self.network, NetworkConfig) and self.network.frame is Frame.AGENT
+
+def _toml_lines(values: Mapping[str, Any]) -> list[str]:
+    """Return assignments; strings, numbers, booleans and lists of them are written alike in JSON and TOML."""
+    return [f"{name} = {json.dumps(value)}" for name, value in values.items()]
 
 
 def parse_method(name: str) -> Method:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from model.agent_features import HISTORY_SCALE
 from model.arrays import Bools, Floats
 from model.data.batches import Batches
 from model.data.cache import Cache
@@ -121,7 +122,8 @@ class Validation:
 
 def _stood(cache: Cache) -> Bools:
     """Return which pairs' agents stood before now: [P]."""
-    scale = state_scale(AgentType.VEHICLE, AgentType.VEHICLE)[:2]
+    own_frame = cache.manifest.key.agent_frame
+    scale = (HISTORY_SCALE if own_frame else state_scale(AgentType.VEHICLE, AgentType.VEHICLE))[:2]
     history = np.array(cache.history[..., :2]) * scale  # Relative to now, however it is turned
     seen = np.arange(history.shape[1]) >= cache.first[:, None]
     return stood(np.where(seen[..., None], history, np.nan))
