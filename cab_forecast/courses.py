@@ -12,7 +12,7 @@ _Floats = npt.NDArray[np.float64]
 
 _STANDING_M = 0.2
 """m between two observations below which their direction is noise."""
-_STAYS_M = 1.0
+_STAYS_M = 1.5
 """m; who gets no farther stays."""
 _STOPS_M_S = 0.5
 """m/s at the end, at or below which an agent stops."""
