@@ -256,7 +256,8 @@ class AgentFrameNetwork(nn.Module):
         xx = cos.square() * along + sin.square() * across
         yy = sin.square() * along + cos.square() * across
         xy = cos * sin * (along - across)
-        return torch.stack([xx, xy, xy, yy], dim=-1).unflatten(-1, (2, 2))
+        covariance: Tensor = torch.stack([xx, xy, xy, yy], dim=-1).unflatten(-1, (2, 2))
+        return covariance
 
     def forward(self, features: Features, context: Context, steps: int) -> tuple[Tensor, Positions]:
         """Return log-probabilities of the modes [N, K], and their positions relative to now, ground frame.
@@ -317,7 +318,8 @@ def read_patch(patches: Tensor, x: Tensor, y: Tensor, geometry: PatchGeometry) -
     column = (y * geometry.pixels_per_meter + geometry.columns_right + 0.5) * (2 / size) - 1
     grid = torch.stack([column, row], dim=-1).flatten(1, -2)[:, None]  # [N, 1, P, 2]
     values: Tensor = F.grid_sample(patches, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
-    return values.unflatten(-1, x.shape[1:])[:, :, 0]
+    layers: Tensor = values.unflatten(-1, x.shape[1:])[:, :, 0]
+    return layers
 
 
 def _neighbors(features: Features, full: bool) -> tuple[Tensor, Tensor]:

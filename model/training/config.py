@@ -150,6 +150,7 @@ class TrainingConfig(BaseModel):
 
     @property
     def in_agent_frame(self) -> bool:
+        """Whether the network sees and forecasts in the agent's frame."""
         return isinstance(self.network, NetworkConfig) and self.network.frame is Frame.AGENT
 
     @property

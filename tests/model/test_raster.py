@@ -8,7 +8,7 @@ from PIL import Image
 
 from model.arrays import Floats
 from model.geometry import rotate
-from model.raster import PATCH_SIZE, cut_patches
+from model.raster import FAR, NEAR, PATCH_SIZE, PatchGeometry, cut_patches
 from model.scene import Raster
 
 
@@ -175,3 +175,71 @@ def test_a_line_of_one_pixel_stays_in_the_patch_however_fine_the_raster(pixels_p
     assert (drawn > 0.45).all(), drawn.min()
     columns = patch[10:90].argmax(axis=1)
     assert (np.abs(columns - 56) <= 1).all()  # 2 m · 3 px/m left of column 50
+
+
+@pytest.mark.parametrize(
+    ("heading", "ahead", "left", "row", "column"),
+    [(0.0, 30.0, 0.0, 56, 50), (0.0, 0.0, -20.0, 14, 22), (np.pi / 2, 60.0, 30.0, 98, 92)],
+)
+def test_where_a_far_patch_shows_what(
+    heading: float, ahead: float, left: float, row: int, column: int
+) -> None:
+    layers = np.zeros((3, 600, 600), dtype=np.uint8)
+    position = np.array([100.0, 100.0])
+    point = position + rotate(np.array([ahead, left]), np.array(heading))
+    at = np.round(point * 3.0).astype(int)
+    layers[0, at[0] - 1 : at[0] + 2, at[1] - 1 : at[1] + 2] = 1  # a metre wide: wider than a patch's pixel
+    patch = cut_patches(Raster(layers, np.zeros(2), 3.0), position[None], np.array([heading]), FAR)[0]
+    assert np.unravel_index(patch[0].argmax(), patch[0].shape) == (row, column)
+    assert patch[0, row, column] > 0.9
+    assert not patch[1:].any()
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    x=st.floats(95, 105), y=st.floats(95, 105), heading=st.floats(-4, 4), scale=st.sampled_from([1.0, 3.0])
+)
+def test_a_far_patch_shows_nothing_beyond_74_m(x: float, y: float, heading: float, scale: float) -> None:
+    size = int(200 * scale)
+    grid = np.stack(np.meshgrid(np.arange(size), np.arange(size), indexing="ij"), axis=-1) / scale
+    beyond = np.hypot(grid[..., 0] - x, grid[..., 1] - y) > 74.0
+    rng = np.random.default_rng(0)
+    one, other = rng.integers(0, 2, (2, 3, size, size), dtype=np.uint8)
+    other = np.where(beyond, other, one)
+    assert (other != one).any()
+    position, angle = np.array([[x, y]]), np.array([heading])
+    seen, same = (
+        cut_patches(Raster(layers, np.zeros(2), scale), position, angle, FAR, outside=0.5)
+        for layers in (one, other)
+    )
+    np.testing.assert_array_equal(seen, same)
+
+
+@pytest.mark.parametrize("geometry", [NEAR, FAR])
+def test_what_lies_outside_the_raster_is_what_is_asked_for(geometry: PatchGeometry) -> None:
+    raster = Raster(np.ones((3, 60, 60), dtype=np.uint8), np.zeros(2), 3.0)
+    position = np.array([[10.0, 10.0], [500.0, 0.0]])
+    patches = cut_patches(raster, position, np.zeros(2), geometry, outside=0.5)
+    assert (patches[1] == 0.5).all()
+    # The raster's edge is 9.7 m ahead, behind and to the left, 10 m to the right of the first agent
+    row = geometry.rows_behind + int(11 * geometry.pixels_per_meter)
+    np.testing.assert_allclose(patches[0, :, row:], 0.5, atol=1e-5)
+    near = int(8 * geometry.pixels_per_meter)
+    inside = patches[0, :, geometry.rows_behind : geometry.rows_behind + near, 50 - near : 50 + near]
+    np.testing.assert_allclose(inside, 1.0, atol=1e-5)
+
+
+@pytest.mark.parametrize(("geometry", "pixels_per_meter"), [(FAR, 3.0), (FAR, 10.0), (NEAR, 10.0)])
+def test_a_patch_does_not_hang_on_whose_else_are_cut(
+    geometry: PatchGeometry, pixels_per_meter: float
+) -> None:
+    layers = np.random.default_rng(3).integers(0, 2, (3, 900, 900), dtype=np.uint8)
+    raster = Raster(layers, np.array([5.0, -3.0]), pixels_per_meter)
+    middle = raster.origin + 450 / pixels_per_meter
+    others = middle + np.array([[-7.0, -4.1], [-3.3, 2.6], [6.1, 1.7]])
+    heading = np.array([0.3, 2.0, -1.0, 0.7])
+    alone = cut_patches(raster, middle[None], heading[:1], geometry)[0]
+    for count in (1, 2, 3):
+        position = np.concatenate([middle[None], others[:count]])
+        together = cut_patches(raster, position, heading[: 1 + count], geometry)
+        np.testing.assert_allclose(together[0], alone, atol=2e-3)

@@ -12,6 +12,7 @@ from model.checkpoint import load_checkpoint
 from model.convert import ConversionError, UnsafePickleError, convert_trajectron
 from model.cvae import CvaeForecaster
 from model.forecaster import Context, Protocol
+from model.networks.network import AgentNetwork
 from model.scene import AgentType
 from tests.model.convert.assembler import call, legacy_file, module, named, text
 
@@ -57,7 +58,9 @@ def test_its_probabilities_are_the_golden_ones(
     convert_trajectron(source, 12, tmp_path / "out")
     forecaster = load_checkpoint(tmp_path / "out").forecaster()
     assert isinstance(forecaster, CvaeForecaster)
-    logits = forecaster.networks.of(AgentType(kind)).prior(torch.from_numpy(golden["encoding"]), Context.FULL)
+    network = forecaster.networks.of(AgentType(kind))
+    assert isinstance(network, AgentNetwork)
+    logits = network.prior(torch.from_numpy(golden["encoding"]), Context.FULL)
     np.testing.assert_allclose(logits.softmax(-1), golden["z_probs"], atol=1e-6)
 
 
