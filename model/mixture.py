@@ -178,10 +178,13 @@ def merge_modes(
         raise ValueError(f"distances to merge by must not be negative: {min_distance_m}, {relative_distance}")
     # Modes by rank: the heaviest first, and of equals the lower number
     ranked, order = mixture.log_weights.sort(dim=-1, descending=True, stable=True)  # [N, K] each
-    by_rank = _leaders(_of_modes(mixture.means, order), ranked > -math.inf, min_distance_m, relative_distance)
+    by_rank = _leaders(
+        _of_modes(mixture.means, order), ranked != -math.inf, min_distance_m, relative_distance
+    )
     # Of each mode the number of the one that stands for it: ranks become numbers, then stand in their order
     leaders = torch.empty_like(order).scatter_(1, order, order.gather(1, by_rank))
-    alive = mixture.log_weights > -math.inf
+    # What is no number stays, and shows in what is made of it
+    alive = mixture.log_weights != -math.inf
 
     numbers = torch.arange(order.shape[1], device=order.device)
     kept = alive & (leaders == numbers)

@@ -398,3 +398,16 @@ def test_a_negative_distance_is_refused() -> None:
 def test_of_no_agents_nothing_is_merged() -> None:
     merged = merge_modes(mixture()[:0])
     assert len(merged.mixture) == len(merged.counts) == 0
+
+
+def test_merging_a_forecast_that_is_no_number_leaves_it_so() -> None:
+    mixture = TrajectoryMixture(
+        torch.full((2, 3), math.nan),
+        torch.full((2, 3, 4, 2), math.nan),
+        torch.full((2, 3, 4, 2, 2), math.nan),
+        torch.zeros(2, 2, dtype=torch.float64),
+    )
+    merged = merge_modes(mixture).mixture
+    assert merged.log_weights.shape[1] >= 1
+    assert merged.log_weights.isnan().all()
+    assert merged.most_likely_trajectory().isnan().all()
