@@ -4,18 +4,14 @@ Standing and parked cars, queues, reversing, bends of any radius, fast roads, ve
 Roads, drivers and traffic are drawn from wide ranges; nothing is taken from recorded data.
 """
 
-import hashlib
-import inspect
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from sys import modules
 from typing import NamedTuple
 
 import numpy as np
 
 from model.arrays import Bools, Floats
-from model.data import synthetic_roads, synthetic_traffic
 from model.data.checks import FUTURE_STEPS, check_pairs
 from model.data.scenes import DataError, Pair, SceneRecord, Track
 from model.data.synthetic_roads import (
@@ -35,8 +31,10 @@ from model.data.synthetic_traffic import TICK, Drives, Vehicle, clear, draw_driv
 from model.geometry import rotate, wrap_angle
 from model.scene import STEP_SECONDS, AgentType
 
-SCENES = {"train": 1000, "validation": 60}
-"""Scenes by split."""
+SCENES = {"train": 1000, "validation": 60, "hard": 500}
+"""Scenes by split; those of ``hard`` are of the kinds in ``_HARD``."""
+VERSION = 1
+"""Of what is generated; whoever changes that raises it, so that caches of other scenes are stale."""
 PAIRS = 10
 """The most pairs of a scene."""
 MARGIN = 77.0
@@ -80,6 +78,8 @@ _KINDS = {
     "queue": Kind(0.06, (0.5, 0.4, 0.1), (20.0, 500.0), 1.2, (0.3, 2.0)),
     "parking": Kind(0.11, (0.9, 0.1, 0.0), (60.0, 800.0), 0.6, (4.0, 11.0)),
 }
+_HARD = {"junction": 0.3, "bends": 0.1, "lead": 0.4, "city": 0.2}
+"""Shares of the split ``hard``: standing leads, junctions, bends, sudden braking."""
 _WISHED = {
     "parked": 0.1,
     "standing": 0.15,
@@ -131,11 +131,8 @@ class SyntheticReader:
 
     @property
     def place(self) -> str:
-        """The seed, and a digest of the code: other code makes other data."""
-        digest = hashlib.sha256()
-        for module in (modules[__name__], synthetic_roads, synthetic_traffic):
-            digest.update(inspect.getsource(module).encode())
-        return f"seed {self._seed} of {digest.hexdigest()[:16]}"
+        """The seed and the version of the generator, as other code makes other data."""
+        return f"seed {self._seed}, version {VERSION}"
 
     @property
     def splits(self) -> tuple[str, ...]:
@@ -160,7 +157,8 @@ class SyntheticReader:
             number: of the scene, from 0 on.
         """
         rng = np.random.default_rng([self._seed, list(SCENES).index(split), number])
-        shares = np.array([kind.share for kind in _KINDS.values()])
+        by_kind = {name: kind.share for name, kind in _KINDS.items()} if split != "hard" else _HARD
+        shares = np.array([by_kind.get(name, 0.0) for name in _KINDS])
         name = str(rng.choice(list(_KINDS), p=shares / shares.sum()))
         while True:
             plan = _plan(rng, name)

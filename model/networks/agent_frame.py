@@ -37,6 +37,8 @@ _WIDTH = 64
 """Of every encoding."""
 _HIDDEN = 128
 """Of a mode."""
+_DROPOUT = 0.2
+"""Of the maps' encodings, of the whole encoding, and of each mode's hidden layer."""
 _STEP_WIDTH = 32
 """Of what is read at one step of a mode."""
 _CONTROL_SCALE = (0.3, 2.0)
@@ -175,8 +177,9 @@ class AgentFrameNetwork(nn.Module):
         self.config = config
         self.history_encoder = HistoryLSTM(STATE_SIZE[AgentType.VEHICLE], _WIDTH)
         self.neighbor_encoder = NeighborEncoder() if config.neighbor_types else None
-        self.map_encoder = MapEncoder(0.1) if config.uses_map else None
-        self.far_map_encoder = MapEncoder(0.1) if config.far_map else None
+        self.map_encoder = MapEncoder(_DROPOUT) if config.uses_map else None
+        self.far_map_encoder = MapEncoder(_DROPOUT) if config.far_map else None
+        self.dropout = nn.Dropout(_DROPOUT)
         parts = 1 + sum(
             part is not None for part in (self.neighbor_encoder, self.map_encoder, self.far_map_encoder)
         )
@@ -223,7 +226,7 @@ class AgentFrameNetwork(nn.Module):
                 parts.append(encoder(features[name]))
             elif encoder is not None:
                 parts.append(encoder(own.new_zeros(1, 3, 100, 100)).expand(len(own), -1))
-        encoding: Tensor = self.context(torch.cat(parts, dim=1))
+        encoding: Tensor = self.dropout(self.context(torch.cat(parts, dim=1)))
         return encoding
 
     def decode(self, encoding: Tensor, features: Features, context: Context) -> Modes:
@@ -239,6 +242,7 @@ class AgentFrameNetwork(nn.Module):
         proposal = drive(controls * scale, heading, speed)
         read = self._read(proposal, features, context)
         refined = F.relu(self.refine_hidden(torch.cat([hidden, read.flatten(2)], dim=-1)))
+        refined = self.dropout(refined)
         controls = controls + self.refine(refined).unflatten(-1, (STEPS, 2))
         path = drive(controls * scale, heading, speed)
         usual = self.width.new_tensor(_USUAL_LOG_SIGMA)

@@ -109,6 +109,10 @@ class TrainingConfig(BaseModel):
     states; in the agent's frame only."""
     hide: bool = False
     """Take map and neighbours away at random (``model.data.hiding``); in the agent's frame only."""
+    jitter: bool = False
+    """Move histories and maps a little each time (``model.data.jittering``); in the agent's frame only."""
+    weight_decay: float = Field(default=0.0, ge=0)
+    """Decoupled from the gradient (AdamW, Loshchilov and Hutter 2019), per unit of learning rate."""
     mixture: MixtureWeights = MixtureWeights()
     """Weights of the objective in the agent's frame."""
     keep: Literal["best", "last"] = "best"
@@ -133,8 +137,8 @@ class TrainingConfig(BaseModel):
     @model_validator(mode="after")
     def _suits_the_frame(self) -> "TrainingConfig":
         if not self.in_agent_frame:
-            if self.variants or self.hide or self.mixture != MixtureWeights():
-                raise ValueError("variants, hide and mixture are for networks of the agent's frame")
+            if self.variants or self.hide or self.jitter or self.mixture != MixtureWeights():
+                raise ValueError("variants, hide, jitter and mixture are for networks of the agent's frame")
             return self
         if self.method not in _IN_AGENT_FRAME:
             raise ValueError(f"frame: {self.method.value} does not learn in the agent's frame")

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from model.cvae import CvaeNetworks
 from model.data.hiding import hide_context
+from model.data.jittering import jitter
 from model.data.packing import unpack_patches
 from model.forecaster import Features
 from model.network_forecaster import Networks
@@ -88,7 +89,9 @@ class DescentLearner(Learner):
         super().__init__(networks)
         set_precision(networks, config.precision)
         scale_dropout(networks, config.dropout_factor)
-        self.optimizer = torch.optim.Adam(self._groups(), lr=config.learning_rate)
+        self.optimizer = torch.optim.AdamW(
+            self._groups(), lr=config.learning_rate, weight_decay=config.weight_decay
+        )
         self._clip = config.gradient_clip
         self._batch_size = config.batch_size
 
@@ -157,12 +160,15 @@ class AgentFrameLearner(DescentLearner):
         self._weights = config.mixture
         self._contrast = config.method is Method.CAB
         self._hide = config.hide
+        self._jitter = config.jitter
 
     def step(self, batches: Sequence[Batch], weights: Weights, rate: float) -> dict[str, Tensor]:
         (batch,) = batches
         features = dict(hide_context(batch.features) if self._hide else batch.features)
         for name in features.keys() & {"map", "far_map"}:
             features[name] = unpack_patches(features[name])
+        if self._jitter:
+            features = jitter(features)
         future = turned(batch.future, -features["heading"].to(batch.future.dtype))
         loss = mixture_objective(self.network, features, future, self._weights, self._contrast)
         self.descend(loss.value, rate)

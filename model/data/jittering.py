@@ -1,0 +1,77 @@
+"""Augmentation by jitter: what a network should not hang on is moved a little each time it is shown.
+
+Each pair is held with a few noisy reports and the map patches cut for them. Shown for many epochs, a network
+learns their very pixels: forecasts then change by metres when a raster is drawn anew or turned.
+"""
+
+from typing import Final
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from model.forecaster import Features
+from model.raster import FAR, NEAR, PatchGeometry
+
+HISTORY_NOISE: Final = (0.0015, 0.006, 0.007, 0.02, 0.07, 0.07, 0.02, 0.04)
+"""Standard deviations, at most, of a history in its scales: 3 cm, 0.1 m/s, 0.2 to 0.35 m/s², 0.01 rad,
+0.02 rad/s."""
+JITTERED: Final = 0.5
+"""Share of the agents whose maps are moved."""
+MAX_TURN_RAD: Final = 0.05
+MAX_SHIFT_M: Final = 0.4
+NO_DIVIDERS: Final = 0.1
+"""Share of the agents whose maps lack a layer of dividers, each of the two: many maps have none."""
+_MAPS = {"map": NEAR, "far_map": FAR}
+
+
+def jitter(features: Features) -> Features:
+    """Return features with noise on histories, and with some agents' maps turned and shifted a little.
+
+    Args:
+        features: in the agents' frames, maps unpacked; histories are left as they are, maps are overwritten.
+    """
+    jittered = dict(features)
+    history = features["history"]
+    count, frames = history.shape[:2]
+    scale = torch.rand(count, 1, 1, device=history.device) * history.new_tensor(HISTORY_NOISE)
+    noise = scale * torch.randn_like(history)
+    noise[:, -1, :2] = 0.0  # the agent is at the origin of its own frame, heading along x
+    noise[:, -1, 6] = 0.0
+    observed = torch.arange(frames, device=history.device) >= features["first"][:, None]
+    jittered["history"] = history + noise * observed[..., None]
+    chosen = (torch.rand(count, device=history.device) < JITTERED).nonzero()[:, 0]
+    turn = MAX_TURN_RAD * (2 * torch.rand(len(chosen), device=history.device) - 1)
+    shift = MAX_SHIFT_M * (2 * torch.rand(len(chosen), 2, device=history.device) - 1)
+    bare = torch.rand(count, 2, device=history.device) < NO_DIVIDERS
+    for name, geometry in _MAPS.items():
+        if name in features:
+            patches = features[name]
+            patches[chosen] = moved(patches[chosen], turn, shift, geometry)
+            for layer in range(2):
+                rows = bare[:, layer].nonzero()[:, 0]
+                known = (patches[rows] != 0).any(dim=1)
+                patches[rows, layer + 1] = -known.to(patches.dtype)
+            jittered[name] = patches
+    return jittered
+
+
+def moved(patches: Tensor, turn: Tensor, shift: Tensor, geometry: PatchGeometry) -> Tensor:
+    """Return patches as they were had the agents' poses been a little different.
+
+    Args:
+        patches: [n, 3, S, S].
+        turn: [n] rad, of the heading.
+        shift: [n, 2] m, ahead and to the left.
+        geometry: of the patches.
+    """
+    size = geometry.size
+    row = torch.arange(size, device=patches.device, dtype=patches.dtype) - geometry.rows_behind
+    column = torch.arange(size, device=patches.device, dtype=patches.dtype) - geometry.columns_right
+    cos, sin = turn.cos()[:, None, None], turn.sin()[:, None, None]
+    offset = geometry.pixels_per_meter * shift
+    ahead = cos * row[:, None] - sin * column[None] + offset[:, :1, None] + geometry.rows_behind
+    left = sin * row[:, None] + cos * column[None] + offset[:, 1:, None] + geometry.columns_right
+    grid = torch.stack([left, ahead], dim=-1)
+    grid = (grid + 0.5) * (2 / size) - 1
+    return F.grid_sample(patches, grid, mode="bilinear", padding_mode="border", align_corners=False)
