@@ -104,7 +104,7 @@ class NeighborEncoder(nn.Module):
             present: [N, M] bool, which of them there are.
             own: [N, 64], the encoded history.
         """
-        count = len(own)
+        count = own.shape[0]
         tokens = F.relu(self.token(neighbors))
         tokens = torch.cat([self.nobody.expand(count, 1, -1), tokens], dim=1)
         there = torch.cat([present.new_ones(count, 1), present], dim=1)
@@ -225,7 +225,7 @@ class AgentFrameNetwork(nn.Module):
             if encoder is not None and full:
                 parts.append(encoder(features[name]))
             elif encoder is not None:
-                parts.append(encoder(own.new_zeros(1, 3, 100, 100)).expand(len(own), -1))
+                parts.append(encoder(own.new_zeros(1, 3, 100, 100)).expand(own.shape[0], -1))
         encoding: Tensor = self.dropout(self.context(torch.cat(parts, dim=1)))
         return encoding
 
@@ -329,7 +329,7 @@ def read_patch(patches: Tensor, x: Tensor, y: Tensor, geometry: PatchGeometry) -
 def _neighbors(features: Features, full: bool) -> tuple[Tensor, Tensor]:
     neighbors = features["neighbors"] if full else features["history"].new_zeros(1, 1, NEIGHBOR_FEATURES)
     if not full:
-        neighbors = neighbors.expand(len(features["history"]), -1, -1)
+        neighbors = neighbors.expand(features["history"].shape[0], -1, -1)
     return neighbors, neighbors[..., -1] > 0
 
 

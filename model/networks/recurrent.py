@@ -34,7 +34,7 @@ class HistoryLSTM(nn.Module):
             [N, hidden_size].
         """
         gates_in = F.linear(inputs, self.weight_ih, self.bias_ih + self.bias_hh)
-        hidden = inputs.new_zeros(len(inputs), self.hidden_size)
+        hidden = inputs.new_zeros(inputs.shape[0], self.hidden_size)
         cell = hidden
         started = torch.arange(inputs.shape[1], device=inputs.device)[:, None] >= first  # [F, N]
         if torch.compiler.is_exporting():  # a graph cannot hang on values; the result is the same
