@@ -1,0 +1,151 @@
+"""The objective of networks in the agent's frame."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+from torch.distributions import MultivariateNormal
+
+from model.bench import features_in_agent_frame
+from model.forecaster import Context, Features
+from model.networks.agent_frame import STEPS, AgentFrameNetwork
+from model.networks.config import BlindContext, Frame, NetworkConfig
+from model.training.mixture_objective import MixtureWeights, mixture_objective, step_log_density
+
+CONFIG = NetworkConfig(frame=Frame.AGENT, far_map=True, blind=BlindContext.NULL, modes=12)
+NOTHING = dict.fromkeys(
+    ("likelihood", "joint_likelihood", "nearest", "choice", "expected", "off_road", "proposal", "apart"), 0.0
+)
+
+
+@pytest.fixture
+def network() -> AgentFrameNetwork:
+    torch.manual_seed(2)
+    return AgentFrameNetwork(CONFIG).eval()
+
+
+@pytest.fixture
+def features() -> Features:
+    return features_in_agent_frame(5)
+
+
+@pytest.fixture
+def future() -> Tensor:
+    steps = torch.arange(1, STEPS + 1)
+    return torch.stack([2.0 * steps, 0.1 * steps.square()], dim=-1).expand(5, STEPS, 2)
+
+
+def only(**weights: float) -> MixtureWeights:
+    """Weights of which all others are zero."""
+    return MixtureWeights.model_validate(NOTHING | weights)
+
+
+def value(network: AgentFrameNetwork, features: Features, future: Tensor, weights: MixtureWeights) -> Tensor:
+    return mixture_objective(network, features, future, weights, contrast=False).value
+
+
+def reference(
+    network: AgentFrameNetwork, features: Features, future: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Probabilities [N, K], distances [N, K, T] and log-densities [N, K, T] out of the forward itself."""
+    turned = features | {"heading": torch.zeros(len(future), dtype=torch.float64)}
+    with torch.no_grad():
+        log_weights, positions = network(turned, Context.FULL, STEPS)
+    distance = (positions.mean - future[:, None]).norm(dim=-1)
+    normal = MultivariateNormal(positions.mean.double(), positions.covariance.double())
+    return log_weights.exp(), distance, normal.log_prob(future[:, None].double())
+
+
+def test_each_term_by_itself(network: AgentFrameNetwork, features: Features, future: Tensor) -> None:
+    weights, distance, density = reference(network, features, future)
+    mean = distance.mean(dim=-1)
+    score = mean + 0.5 * distance[..., -1]
+    ranked = weights.argsort(dim=1, descending=True)
+    rows = torch.arange(5)
+    expected = {
+        "likelihood": -torch.logsumexp(weights.double().log()[..., None] + density, dim=1).mean(),
+        "joint_likelihood": -torch.logsumexp(weights.double().log() + density.sum(-1), dim=1).mean() / STEPS,
+        "nearest": mean[rows, score.argmin(dim=1)].mean(),
+        "likeliest": mean[rows, ranked[:, 0]].mean(),
+        "expected": (weights * mean).sum(dim=1).mean(),
+        "choice": -((-score).softmax(dim=1) * weights.log()).sum(dim=1).mean(),
+    }
+    for count in (5, 10):
+        first = ranked[:, :count]
+        chosen = first.gather(1, score.gather(1, first).argmin(dim=1, keepdim=True))
+        expected[f"nearest_of_{count}"] = mean.gather(1, chosen).mean()
+    for name, wanted in expected.items():
+        got = value(network, features, future, only(**{name: 1.0}))
+        assert got.item() == pytest.approx(wanted.item(), rel=2e-3, abs=2e-3), name
+
+
+def test_density_has_the_floor(network: AgentFrameNetwork, features: Features, future: Tensor) -> None:
+    with torch.no_grad():
+        network.sigma.bias.fill_(-50.0)
+        modes = network.decode(network.encode(features, Context.FULL), features, Context.FULL)
+        there = torch.stack([modes.path.x[:, 0], modes.path.y[:, 0]], dim=-1)
+        density = step_log_density(network, modes, there)[:, 0]
+    # On the mean of a mode as narrow as can be: 0.1 m at 1 s, 0.3 m at 6 s
+    least = torch.tensor([0.1, 0.3])
+    narrowest = -2 * least.log() - math.log(2 * math.pi)
+    assert (density[:, [1, 11]] <= narrowest + 1e-3).all()
+    assert (density[:, [1, 11]] > narrowest - 0.5).all()
+
+
+def test_the_likeliest_is_pulled_without_moving_probabilities(
+    network: AgentFrameNetwork, features: Features, future: Tensor
+) -> None:
+    value(network, features, future, only(likeliest=1.0)).backward()  # type: ignore[no-untyped-call]
+    assert network.propose.weight.grad is not None
+    assert network.propose.weight.grad.abs().max() > 0
+    for head in (network.logits, network.mode_logits):
+        assert head.weight.grad is None or head.weight.grad.abs().max() == 0
+
+
+def test_the_expected_distance_moves_probabilities(
+    network: AgentFrameNetwork, features: Features, future: Tensor
+) -> None:
+    value(network, features, future, only(expected=1.0)).backward()  # type: ignore[no-untyped-call]
+    assert network.mode_logits.weight.grad is not None
+    assert network.mode_logits.weight.grad.abs().max() > 0
+
+
+def test_off_road_is_the_share_of_the_steps_there(
+    network: AgentFrameNetwork, features: Features, future: Tensor
+) -> None:
+    for level, wanted in ((-1.0, 1.0), (1.0, 0.0), (0.0, 0.0)):
+        map_of = features | {"far_map": torch.full_like(features["far_map"], level)}
+        modes = network.decode(network.encode(map_of, Context.FULL), map_of, Context.FULL)
+        inside = (modes.path.x < 55) & (modes.path.x > -5) & (modes.path.y.abs() < 30)
+        got = value(network, map_of, future, only(off_road=1.0)).item()
+        assert got == pytest.approx(wanted, abs=0.0 if inside.all() and not wanted else 0.35)
+
+
+def test_cab_adds_its_blind_forecast_and_presses_apart(
+    network: AgentFrameNetwork, features: Features, future: Tensor
+) -> None:
+    plain = only(likelihood=1.0)
+    full = value(network, features, future, plain).item()
+    loss = mixture_objective(
+        network, features, future, plain.model_copy(update={"blind": 0.5}), contrast=True
+    )
+    blind = loss.terms["nll_blind"].item()
+    assert loss.value.item() == pytest.approx(full + 0.5 * blind, rel=1e-5)
+    apart = mixture_objective(
+        network, features, future, plain.model_copy(update={"blind": 0.0, "apart": 2.0}), contrast=True
+    )
+    assert apart.terms["kl_full_blind"].item() > 0
+    assert apart.value.item() == pytest.approx(full - 2 * apart.terms["kl_full_blind"].item(), rel=1e-4)
+
+
+def test_a_part_of_the_batch_may_be_forecast_blindly(
+    network: AgentFrameNetwork, features: Features, future: Tensor
+) -> None:
+    weights = only(likelihood=1.0, blind=1.0, blind_share=0.4)
+    some = {name: values[:2] for name, values in features.items()}
+    part = mixture_objective(network, features, future, weights, contrast=True).terms["nll_blind"]
+    whole = mixture_objective(network, some, future[:2], only(likelihood=1.0), contrast=True).terms[
+        "nll_blind"
+    ]
+    assert part.item() == pytest.approx(whole.item(), rel=1e-5)
