@@ -5,12 +5,13 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from model.agent_features import agent_frame_features
 from model.data.mirroring import mirror
 from model.data.protocols import frame_scene
 from model.data.scenes import SceneRecord, Track
 from model.features import scene_features
 from model.forecaster import Context, Features, Protocol
-from model.networks.config import NetworkConfig
+from model.networks.config import Frame, NetworkConfig
 from model.networks.drawing import draw_boxes
 from model.scene import AgentType, Raster
 from model.standardization import HEADING
@@ -96,3 +97,28 @@ def test_only_the_chosen_are_mirrored_and_twice_is_not_at_all() -> None:
         else:
             assert torch.equal(twice[name], value), name
     assert not torch.equal(once["history"][chosen][..., HEADING], features["history"][chosen][..., HEADING])
+
+
+def test_mirroring_features_in_the_agents_frame_is_mirroring_the_scene() -> None:
+    config = NetworkConfig(frame=Frame.AGENT)
+    for seed in range(4):
+        whole = record(seed=seed)
+        features = []
+        for scene in (whole, reflected(whole)):
+            seen, tracks = frame_scene(scene, 8, Protocol.CAUSAL, 5)
+            features.append(agent_frame_features(seen, np.flatnonzero(tracks == 0), config, Context.FULL))
+        here, there = features
+        future = torch.randn(1, 12, 2)
+        mirrored, its_future = mirror(here, future, torch.tensor([True]))
+        for name in ("speed", "history", "neighbors", "heading"):
+            turn = (
+                torch.sin(mirrored[name] - there[name]) if name == "heading" else mirrored[name] - there[name]
+            )
+            assert turn.abs().max() < 1e-5, name
+        torch.testing.assert_close(its_future, future * torch.tensor([1.0, -1.0]))
+        # The column that has no partner, and half a pixel at edges, may differ
+        off = (mirrored["map"] - there["map"])[..., 1:].abs() > 0.05
+        assert off.float().mean() < 0.02
+        same, _ = mirror(here, future, torch.tensor([False]))
+        for name, values in here.items():
+            torch.testing.assert_close(same[name], values)
