@@ -1,5 +1,6 @@
 """From data to a checkpoint that serves."""
 
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from model.checkpoint import load_checkpoint
 from model.data.scenes import DataError
 from model.data.sources import READERS, parse_data
 from model.forecaster import Protocol
-from model.networks.config import CoverNetConfig
+from model.networks.config import BlindContext, CoverNetConfig, Frame, NetworkConfig
 from model.registry import Registry
 from model.scene import AgentType
 from model.training.calibration import MOST, Calibration
@@ -141,3 +142,49 @@ def test_a_log_replaces_the_rows_of_epochs_done_again(tmp_path: Path) -> None:
     for epoch, loss in ((1, 3.0), (2, 2.0), (2, 1.0)):
         log.add(Progress(epoch, epoch * 10, epoch, loss, 1.0), {"loss": loss})
     assert [(row["epoch"], row["loss"]) for row in log.rows()] == [("1", "3.0"), ("2", "1.0")]
+
+
+@pytest.mark.parametrize("method", [Method.CAB, Method.TRAJECTRON])
+def test_a_run_in_the_agents_frame_on_several_sources(run: Run, method: Method) -> None:
+    blind = BlindContext.NULL if method is Method.CAB else BlindContext.NONE
+    network = NetworkConfig(frame=Frame.AGENT, far_map=True, blind=blind, modes=6)
+    config = small_config(
+        method,
+        epochs=2,
+        network=network,
+        rotate=False,
+        mirror=True,
+        variants=1,
+        hide=True,
+        jitter=True,
+        keep="last",
+        weight_decay=0.01,
+        leaving_share=0.5,
+    )
+    source = replace(run.source, also=(("made", run.source.path, "some"),), report_split="some")
+    own = replace(run, config=config, source=source)
+    folder, reports = go(own)
+    assert [progress.best_epoch for progress in reports] == [1, 2]
+    checkpoint = load_checkpoint(folder)
+    assert checkpoint.network.model_dump() == network.model_dump()
+    vehicles = checkpoint.tensors
+    assert vehicles["vehicle.width"].shape == (12,)
+    assert not torch.equal(vehicles["vehicle.width"], torch.ones(12))
+    card = (folder / "README.md").read_text()
+    for told in (
+        "Differs from the published network",
+        "merged forecasts",
+        "--also made:DATA@some",
+        "hide = true",
+    ):
+        assert told in card, told
+    # What the card holds trains again
+    settings = tomllib.loads(card.split("```toml\n")[1].split("```")[0])
+    assert settings["mixture"]["nearest"] == config.mixture.nearest
+    assert checkpoint.info.trained_on.count("split some") == 2
+    # An interrupted run comes to the same, whatever was drawn
+    first = replace(own, out=run.out.parent / "parts", config=config.model_copy(update={"epochs": 1}))
+    go(first)
+    second, _ = go(replace(first, config=config))
+    for name, tensor in load_checkpoint(second).tensors.items():
+        torch.testing.assert_close(tensor, vehicles[name], atol=1e-6, rtol=1e-5, msg=name)
