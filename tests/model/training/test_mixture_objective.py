@@ -96,7 +96,7 @@ def test_density_has_the_floor(network: AgentFrameNetwork, features: Features, f
 def test_the_likeliest_is_pulled_without_moving_probabilities(
     network: AgentFrameNetwork, features: Features, future: Tensor
 ) -> None:
-    value(network, features, future, only(likeliest=1.0)).backward()  # type: ignore[no-untyped-call]
+    value(network, features, future, only(likeliest=1.0)).backward()
     assert network.propose.weight.grad is not None
     assert network.propose.weight.grad.abs().max() > 0
     for head in (network.logits, network.mode_logits):
@@ -106,7 +106,7 @@ def test_the_likeliest_is_pulled_without_moving_probabilities(
 def test_the_expected_distance_moves_probabilities(
     network: AgentFrameNetwork, features: Features, future: Tensor
 ) -> None:
-    value(network, features, future, only(expected=1.0)).backward()  # type: ignore[no-untyped-call]
+    value(network, features, future, only(expected=1.0)).backward()
     assert network.mode_logits.weight.grad is not None
     assert network.mode_logits.weight.grad.abs().max() > 0
 
