@@ -82,7 +82,8 @@ class Batches:
         future, heading = cache.future[recorded], cache.heading[recorded]
         paths = rotate_vectors(future.astype(np.float64), -heading[:, None])
         self._paths = torch.from_numpy(paths.astype(np.float32))
-        self._leaving = torch.from_numpy(_leaving(cache))[:: 1 + key.variants]
+        stood, left = _stood_and_left(cache)
+        self._leaving, self._staying = torch.from_numpy(stood & left), torch.from_numpy(stood & ~left)
         looks = config is None or config.looks_at_map(AgentType.VEHICLE)
         self._cut = PatchCutter(cache, device) if looks and not key.agent_frame else None
         self._device = device
@@ -100,6 +101,11 @@ class Batches:
     def leaving(self) -> Tensor:
         """[P] bool, pairs that stood for the whole history and leave within 3 s; on the CPU."""
         return self._leaving
+
+    @property
+    def staying(self) -> Tensor:
+        """[P] bool, pairs that stood for the whole history and are there after 3 s; on the CPU."""
+        return self._staying
 
     @property
     def paths(self) -> Tensor:
@@ -146,14 +152,14 @@ LEFT_M = 2.0
 """m; who is farther away than that after 3 s has left."""
 
 
-def _leaving(cache: Cache) -> Bools:
-    """Return which rows stood for the whole history and leave within 3 s: [R]."""
+def _stood_and_left(cache: Cache) -> tuple[Bools, Bools]:
+    """Return which pairs stood for the whole history, and which are elsewhere after 3 s: [P] each."""
+    rows = slice(None, None, 1 + cache.manifest.key.variants)
     scale = HISTORY_SCALE if cache.manifest.key.agent_frame else _GROUND_SCALE
-    begun = cache.history[:, 0, :2] * scale[:2]
-    stood = (cache.first == 0) & (np.hypot(begun[:, 0], begun[:, 1]) < STOOD_M)
-    after = cache.future[:, 5]
-    leaving: Bools = stood & (np.hypot(after[:, 0], after[:, 1]) > LEFT_M)
-    return leaving
+    begun = cache.history[rows, 0, :2] * scale[:2]
+    after = cache.future[rows, 5]
+    stood = (cache.first[rows] == 0) & (np.hypot(begun[:, 0], begun[:, 1]) < STOOD_M)
+    return np.asarray(stood), np.asarray(np.hypot(after[:, 0], after[:, 1]) > LEFT_M)
 
 
 _GROUND_SCALE = state_scale(AgentType.VEHICLE, AgentType.VEHICLE)
@@ -191,6 +197,11 @@ class JoinedPairs:
     def leaving(self) -> Tensor:
         """[P], as of ``Batches``."""
         return torch.cat([one.leaving for one in self._sources])
+
+    @property
+    def staying(self) -> Tensor:
+        """[P], as of ``Batches``."""
+        return torch.cat([one.staying for one in self._sources])
 
     @property
     def paths(self) -> Tensor:

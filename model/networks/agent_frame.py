@@ -19,7 +19,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from model.agent_features import NEIGHBOR_FEATURES, NEIGHBOR_POSITION_SCALE, NEIGHBOR_VELOCITY_SCALE
+from model.agent_features import (
+    NEIGHBOR_FEATURES,
+    NEIGHBOR_POSITION_SCALE,
+    NEIGHBOR_VELOCITY_SCALE,
+)
 from model.forecaster import Context, Features
 from model.networks.config import NetworkConfig
 from model.networks.dynamics import Positions
@@ -37,8 +41,10 @@ _WIDTH = 64
 """Of every encoding."""
 _HIDDEN = 128
 """Of a mode."""
-_DROPOUT = 0.2
-"""Of the maps' encodings, of the whole encoding, and of each mode's hidden layer."""
+_DROPOUT = 0.1
+"""Of the maps' encodings and of the whole encoding."""
+_NEAR_M = (20.0, 4.0)
+"""m ahead and to the left, within which a neighbour's place is told finely."""
 _STEP_WIDTH = 32
 """Of what is read at one step of a mode."""
 _CONTROL_SCALE = (0.3, 2.0)
@@ -52,8 +58,12 @@ _READ_AHEAD_M = (0.0, 5.0)
 """Where the map is read around each position of a mode, m, in the frame of the path there."""
 _READ_EVERY = 2
 """Steps from one at which it is read to the next."""
-_NEAR_M, _WIDE_M = 2.5, 8.0
-"""Widths of the bumps by which a mode feels how near it comes to a neighbour."""
+_NARROW_M, _WIDE_M = 1.2, 3.0
+"""Widths across a path within which a neighbour is on it."""
+_HALF_LENGTH_M = 3.0
+"""m; a neighbour reaches about that far ahead and behind, the own length included."""
+_GAP_M = 12.0
+"""m, by which what is ahead counts for less."""
 
 
 class MapEncoder(nn.Module):
@@ -90,7 +100,9 @@ class NeighborEncoder(nn.Module):
     def __init__(self, heads: int = 4) -> None:
         super().__init__()
         self.heads = heads
-        self.token = nn.Sequential(nn.Linear(NEIGHBOR_FEATURES, _WIDTH), nn.ReLU(), nn.Linear(_WIDTH, _WIDTH))
+        self.token = nn.Sequential(
+            nn.Linear(NEIGHBOR_FEATURES + 2, _WIDTH), nn.ReLU(), nn.Linear(_WIDTH, _WIDTH)
+        )
         self.nobody = nn.Parameter(torch.zeros(_WIDTH))
         self.query = nn.Linear(_WIDTH, _WIDTH)
         self.key_value = nn.Linear(_WIDTH, 2 * _WIDTH)
@@ -105,7 +117,9 @@ class NeighborEncoder(nn.Module):
             own: [N, 64], the encoded history.
         """
         count = own.shape[0]
-        tokens = F.relu(self.token(neighbors))
+        # In which lane a neighbour is matters by the metre where it is near, and little farther away
+        lane = torch.tanh(neighbors[..., :2] * (NEIGHBOR_POSITION_SCALE / neighbors.new_tensor(_NEAR_M)))
+        tokens = F.relu(self.token(torch.cat([neighbors, lane], dim=-1)))
         tokens = torch.cat([self.nobody.expand(count, 1, -1), tokens], dim=1)
         there = torch.cat([present.new_ones(count, 1), present], dim=1)
         key, value = self.key_value(tokens).chunk(2, dim=-1)
@@ -194,7 +208,7 @@ class AgentFrameNetwork(nn.Module):
             if config.far_map
             else None
         )
-        self.read_neighbors = nn.Linear(2, _STEP_WIDTH, bias=False) if config.neighbor_types else None
+        self.read_neighbors = nn.Linear(3, _STEP_WIDTH, bias=False) if config.neighbor_types else None
         self.refine_hidden = nn.Linear(_HIDDEN + STEPS // _READ_EVERY * _STEP_WIDTH, _HIDDEN)
         self.refine = nn.Linear(_HIDDEN, 2 * STEPS)
         self.sigma = nn.Linear(_HIDDEN, 2 * STEPS)
@@ -242,7 +256,6 @@ class AgentFrameNetwork(nn.Module):
         proposal = drive(controls * scale, heading, speed)
         read = self._read(proposal, features, context)
         refined = F.relu(self.refine_hidden(torch.cat([hidden, read.flatten(2)], dim=-1)))
-        refined = self.dropout(refined)
         controls = controls + self.refine(refined).unflatten(-1, (STEPS, 2))
         path = drive(controls * scale, heading, speed)
         usual = self.width.new_tensor(_USUAL_LOG_SIGMA)
@@ -301,7 +314,7 @@ class AgentFrameNetwork(nn.Module):
             for layer, values in zip(self.read_map, layers.unbind(1), strict=True):
                 read = read + layer(values)
         if self.read_neighbors is not None:
-            read = read + self.read_neighbors(_closeness(x, y, features))
+            read = read + self.read_neighbors(_in_the_way(Path(x, y, heading, speed), features))
         return F.relu(read, inplace=True)
 
 
@@ -333,20 +346,34 @@ def _neighbors(features: Features, full: bool) -> tuple[Tensor, Tensor]:
     return neighbors, neighbors[..., -1] > 0
 
 
-def _closeness(x: Tensor, y: Tensor, features: Features) -> Tensor:
-    """Return how near each step comes to where a neighbour will be if it goes on as now: [N, K, T, 2]."""
+def _in_the_way(path: Path, features: Features) -> Tensor:
+    """Return how much neighbours are in the way of each mode if they go on as now: [N, K, T', 3].
+
+    Between one read step and the next, in the frame of the path there: whether a neighbour lies on the path,
+    narrowly and widely, and how near ahead of it one is.
+    """
+    x, y, heading, _ = path
     neighbors = features["neighbors"]
     steps = torch.arange(_READ_EVERY, STEPS + 1, _READ_EVERY, dtype=x.dtype, device=x.device)
     seconds = STEP_SECONDS * steps
     position = NEIGHBOR_POSITION_SCALE * neighbors[:, :, None, 0:2]
-    velocity = NEIGHBOR_VELOCITY_SCALE * neighbors[:, :, None, 4:6]
-    place = position + velocity * seconds[:, None]  # [N, M, T, 2]
-    squared = (x[:, None] - place[..., 0][:, :, None]).square() + (
-        y[:, None] - place[..., 1][:, :, None]
-    ).square()
-    squared = squared.masked_fill(~(neighbors[..., -1] > 0)[:, :, None, None], math.inf)
-    nearest = squared.amin(dim=1)
-    return torch.stack([(-nearest / (2 * w**2)).exp() for w in (_NEAR_M, _WIDE_M)], dim=-1)
+    place = (
+        position + NEIGHBOR_VELOCITY_SCALE * neighbors[:, :, None, 4:6] * seconds[:, None]
+    )  # [N, M, T', 2]
+    east = place[:, None, ..., 0] - x[:, :, None]  # [N, K, M, T']
+    north = place[:, None, ..., 1] - y[:, :, None]
+    cos, sin = heading.cos()[:, :, None], heading.sin()[:, :, None]
+    ahead, aside = cos * east + sin * north, cos * north - sin * east
+    gone = torch.hypot(
+        torch.diff(x, prepend=torch.zeros_like(x[..., :1])),
+        torch.diff(y, prepend=torch.zeros_like(y[..., :1])),
+    )[:, :, None]
+    there = (neighbors[..., -1] > 0)[:, None, :, None].to(x.dtype)
+    passed = torch.sigmoid(ahead + gone + _HALF_LENGTH_M) * torch.sigmoid(_HALF_LENGTH_M - ahead) * there
+    narrow, wide = ((-aside.square() / (2 * width**2)).exp() for width in (_NARROW_M, _WIDE_M))
+    following = torch.sigmoid(ahead + _HALF_LENGTH_M) * (-F.relu(ahead) / _GAP_M).exp() * there
+    met = (narrow * passed, wide * passed, narrow * following)
+    return torch.stack([one.amax(dim=2) for one in met], dim=-1)
 
 
 __all__ = ["FAR", "NEAR", "STEPS", "AgentFrameNetwork", "MapEncoder", "Modes", "Path", "drive", "read_patch"]

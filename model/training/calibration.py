@@ -121,7 +121,8 @@ _JudgedPaths = Sequence[tuple[Modes, Floats]]
 
 
 def _judge_paths(network: AgentFrameNetwork, pairs: BatchSource) -> _JudgedPaths:
-    chosen = torch.linspace(0, len(pairs) - 1, min(PAIRS, len(pairs))).long().unique()
+    everyday = (~pairs.leaving).nonzero()[:, 0]  # the challenge picks what moves
+    chosen = everyday[torch.linspace(0, len(everyday) - 1, min(PAIRS, len(everyday))).long().unique()]
     judged = []
     for indices in chosen.split(_BATCH):
         features, future = pairs.batch(indices)

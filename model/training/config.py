@@ -103,6 +103,8 @@ class TrainingConfig(BaseModel):
     """Share of the pairs that stood for 2 s and leave within 3 s that an epoch shows. The prediction
     challenge picks what moves: of its pairs that stood two in five leave, of everyday standing cars one in a
     hundred."""
+    staying_copies: int = Field(default=1, ge=1)
+    """How often an epoch shows a pair that stood for 2 s and is there after 3 s."""
     seed: int = 0
     variants: int = Field(default=0, ge=0)
     """V, noisy reports of each training pair (``model.data.sensing``) that are drawn from beside the recorded

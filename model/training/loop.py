@@ -159,7 +159,14 @@ class Trainer:
         """Return the pairs that an epoch shows, in its order."""
         config, train = self.config, self._train
         return epoch_order(
-            train.turned, config.curved_copies, config.seed, epoch, train.leaving, config.leaving_share
+            train.turned,
+            config.curved_copies,
+            config.seed,
+            epoch,
+            train.leaving,
+            config.leaving_share,
+            train.staying,
+            config.staying_copies,
         )
 
     def _batch(self, order: Tensor, number: int, size: int, generator: torch.Generator) -> Batch:

@@ -14,6 +14,8 @@ def epoch_order(
     epoch: int,
     leaving: Tensor | None = None,
     leaving_share: float = 1.0,
+    staying: Tensor | None = None,
+    staying_copies: int = 1,
 ) -> Tensor:
     """Indices of the pairs in the epoch's order; pairs of curved paths come several times.
 
@@ -26,11 +28,15 @@ def epoch_order(
         epoch: counted from 0; each has its own order.
         leaving: [P] bool, pairs that stood and leave; None: there are none.
         leaving_share: how many of these the epoch shows, drawn anew for each.
+        staying: [P] bool, pairs that stood and stay; None: there are none.
+        staying_copies: how often these come.
     """
     generator = torch.Generator().manual_seed(epoch_seed(seed, epoch))
     indices = torch.arange(len(turned))
     curved = indices[turned.abs() > CURVED_RADIANS]
     shown = torch.cat([indices, curved.repeat(curved_copies - 1)])
+    if staying is not None:
+        shown = torch.cat([shown, indices[staying].repeat(staying_copies - 1)])
     if leaving is not None and leaving_share < 1:
         some = shown[leaving[shown]]
         kept = some[torch.randperm(len(some), generator=generator)[: int(leaving_share * len(some))]]

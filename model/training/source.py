@@ -25,6 +25,11 @@ class BatchSource(Interface):
         ...
 
     @property
+    def staying(self) -> Tensor:
+        """[P] bool, pairs that stood for the whole history and are there after 3 s; on the CPU."""
+        ...
+
+    @property
     def paths(self) -> Tensor:
         """[P, T, 2], m, each pair's future in its agent's own frame: x ahead, y to the left; on the CPU."""
         ...
