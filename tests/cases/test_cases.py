@@ -1,11 +1,12 @@
 """The bundled default model on made-up scenes: what a planner may expect of it, row by row."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import get_args
 
 import pytest
+from _pytest.mark import ParameterSet
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
@@ -14,6 +15,7 @@ from tests.cases import given as shared_cases
 from tests.cases.bands import Reading, few_modes, readings, widths
 from tests.cases.case import Case, Pose, Scenario, View
 from tests.cases.checks import LocalForecast
+from tests.cases.outside import OUTSIDE
 from tests.cases.report import TURNED_WITHIN
 from tests.cases.running import Served, bundled, network_frame
 
@@ -22,6 +24,13 @@ pytestmark = pytest.mark.cases
 MODEL = "cab"
 SCENARIOS = {one.name: one for one in scenes.at_poses(scenes.all_rows())}
 DRIVES = {one.name: one for one in driving.drives()}
+
+
+def known(asked: str, names: Iterable[str]) -> list[ParameterSet]:
+    """Return parameters, those that are known to be out of their bands expected to fail."""
+    fails = pytest.mark.xfail(strict=True, raises=AssertionError, reason="known to be out of its band")
+    return [pytest.param(name, marks=[fails] if name in OUTSIDE[asked] else []) for name in names]
+
 
 Answers = dict[str, tuple[Case, LocalForecast]]
 """By the case's name."""
@@ -44,7 +53,7 @@ def own(served: Served) -> Answers:
 
 
 @pytest.fixture(scope="module")
-def known(served: Served, shared: Path) -> Answers:
+def given_cases(served: Served, shared: Path) -> Answers:
     """Forecasts of the cases beside the checkout."""
     folder = shared / "cases"
     if not folder.is_dir():
@@ -52,38 +61,38 @@ def known(served: Served, shared: Path) -> Answers:
     return _answers(served, shared_cases.read_cases(folder))
 
 
-@pytest.mark.parametrize("name", SCENARIOS)
+@pytest.mark.parametrize("name", known("row", SCENARIOS))
 def test_the_row_holds(own: Answers, served: Served, name: str) -> None:
     _within(_row(own, name, served.info.name))
 
 
-@pytest.mark.parametrize("name", SCENARIOS)
+@pytest.mark.parametrize("name", known("width", SCENARIOS))
 def test_no_mode_that_moves_is_too_narrow(own: Answers, name: str) -> None:
     _within(widths(own[name][1]))
 
 
-@pytest.mark.parametrize("name", SCENARIOS)
+@pytest.mark.parametrize("name", known("modes", SCENARIOS))
 def test_few_modes_hold_the_weight(own: Answers, name: str) -> None:
     _within(few_modes(own[name][1]))
 
 
-@pytest.mark.parametrize("name", shared_cases.KNOWN)
-def test_the_row_of_a_shared_case_holds(known: Answers, served: Served, name: str) -> None:
-    _within(_row(known, name, served.info.name))
+@pytest.mark.parametrize("name", known("shared row", shared_cases.KNOWN))
+def test_the_row_of_a_shared_case_holds(given_cases: Answers, served: Served, name: str) -> None:
+    _within(_row(given_cases, name, served.info.name))
 
 
-@pytest.mark.parametrize("name", shared_cases.KNOWN)
-def test_a_shared_case_has_few_modes_and_none_too_narrow(known: Answers, name: str) -> None:
-    _within([*widths(known[name][1]), *few_modes(known[name][1])])
+@pytest.mark.parametrize("name", known("shared modes", shared_cases.KNOWN))
+def test_a_shared_case_has_few_modes_and_none_too_narrow(given_cases: Answers, name: str) -> None:
+    _within([*widths(given_cases[name][1]), *few_modes(given_cases[name][1])])
 
 
-@pytest.mark.parametrize("name", DRIVES)
+@pytest.mark.parametrize("name", known("drive", DRIVES))
 def test_the_likeliest_end_does_not_jump_from_tick_to_tick(served: Served, name: str) -> None:
     drive = DRIVES[name]
     _within(drive.readings(served.answer([one.case() for one in drive.ticks])))
 
 
-@pytest.mark.parametrize("view", get_args(View))
+@pytest.mark.parametrize("view", known("turned", get_args(View)))
 def test_a_turned_and_shifted_scene_has_the_turned_forecasts(served: Served, view: View) -> None:
     # A failure is not shrunk: every example takes a forward, and any angle tells as much as another
     @settings(max_examples=12, deadline=None, phases=[Phase.explicit, Phase.reuse, Phase.generate])
