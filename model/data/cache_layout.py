@@ -66,25 +66,17 @@ class CacheKey(BaseModel):
         variants: int = 0,
     ) -> "CacheKey":
         """Return the key of the cache that ``build_cache`` makes of the same arguments."""
-        if in_agent_frame(config):
-            return cls(
-                reader=type(reader).__name__,
-                data=reader.place,
-                split=split,
-                protocol=protocol,
-                history_frames=history_frames,
-                neighbor_types=NetworkConfig().neighbor_types,
-                agent_frame=True,
-                variants=variants,
-            )
+        own_frame = in_agent_frame(config)
         return cls(
             reader=type(reader).__name__,
             data=reader.place,
             split=split,
             protocol=protocol,
             history_frames=history_frames,
-            neighbor_types=config.neighbor_types,
+            neighbor_types=NetworkConfig().neighbor_types if own_frame else config.neighbor_types,
             drawn=draws(config),
+            agent_frame=own_frame,
+            variants=variants if own_frame else 0,
         )
 
     @property
