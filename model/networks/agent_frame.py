@@ -28,7 +28,7 @@ from model.forecaster import Context, Features
 from model.networks.config import NetworkConfig
 from model.networks.dynamics import Positions
 from model.networks.recurrent import HistoryLSTM
-from model.raster import FAR, NEAR, PatchGeometry
+from model.raster import FAR, PatchGeometry
 from model.scene import STEP_SECONDS, AgentType
 from model.standardization import STATE_SIZE
 
@@ -374,6 +374,3 @@ def _in_the_way(path: Path, features: Features) -> Tensor:
     following = torch.sigmoid(ahead + _HALF_LENGTH_M) * (-F.relu(ahead) / _GAP_M).exp() * there
     met = (narrow * passed, wide * passed, narrow * following)
     return torch.stack([one.amax(dim=2) for one in met], dim=-1)
-
-
-__all__ = ["FAR", "NEAR", "STEPS", "AgentFrameNetwork", "MapEncoder", "Modes", "Path", "drive", "read_patch"]
