@@ -99,12 +99,12 @@ class Batches:
 
     @property
     def leaving(self) -> Tensor:
-        """[P] bool, pairs that stood for the whole history and leave within 3 s; on the CPU."""
+        """[P] bool, pairs that stood for as long as they were seen and leave within 6 s; on the CPU."""
         return self._leaving
 
     @property
     def staying(self) -> Tensor:
-        """[P] bool, pairs that stood for the whole history and are there after 3 s; on the CPU."""
+        """[P] bool, pairs that stood for as long as they were seen and are there after 6 s; on the CPU."""
         return self._staying
 
     @property
@@ -120,8 +120,9 @@ class Batches:
             turns: [n] rad, counter-clockwise, on any device; None: not at all.
         """
         if self.variants:
-            rows = 1 + self.variants
-            indices = indices * rows + torch.randint(rows, indices.shape, device=indices.device)
+            variant = torch.randint(1, 1 + self.variants, indices.shape, device=indices.device)
+            recorded = torch.rand(indices.shape, device=indices.device) < RECORDED_SHARE
+            indices = indices * (1 + self.variants) + torch.where(recorded, 0, variant)
         features, future = self.features(indices)
         return (features, future) if turns is None else rotate(features, future, turns.to(self._device))
 
@@ -147,19 +148,28 @@ class Batches:
 
 
 STOOD_M = 0.5
-"""m; who moved less over the whole history stood."""
+"""m; who moved less over the whole observed history stood."""
 LEFT_M = 2.0
-"""m; who is farther away than that after 3 s has left."""
+"""m; who is farther away than that after 6 s has left."""
+RECORDED_SHARE = 0.4
+"""Of the pairs with variants that are shown as recorded."""
 
 
 def _stood_and_left(cache: Cache) -> tuple[Bools, Bools]:
-    """Return which pairs stood for the whole history, and which are elsewhere after 3 s: [P] each."""
+    """Return which pairs stood for as long as they were seen, and which are elsewhere after 6 s: [P] each.
+
+    Who was seen in one frame only does not count: it may be driving. The end counts, because the prediction
+    challenge has no pair that stands to the end: those that are still there after 3 s are about to leave.
+    """
     rows = slice(None, None, 1 + cache.manifest.key.variants)
     scale = HISTORY_SCALE if cache.manifest.key.agent_frame else _GROUND_SCALE
-    begun = cache.history[rows, 0, :2] * scale[:2]
-    after = cache.future[rows, 5]
-    stood = (cache.first[rows] == 0) & (np.hypot(begun[:, 0], begun[:, 1]) < STOOD_M)
-    return np.asarray(stood), np.asarray(np.hypot(after[:, 0], after[:, 1]) > LEFT_M)
+    first = cache.first[rows]
+    before = cache.history[rows, :, :2] * scale[:2]
+    frames = before.shape[1]
+    distance = np.where(np.arange(frames) >= first[:, None], np.hypot(before[..., 0], before[..., 1]), 0.0)
+    end = cache.future[rows, -1]
+    stood = (first < frames - 1) & (distance.max(axis=1) < STOOD_M)
+    return np.asarray(stood), np.asarray(np.hypot(end[:, 0], end[:, 1]) > LEFT_M)
 
 
 _GROUND_SCALE = state_scale(AgentType.VEHICLE, AgentType.VEHICLE)

@@ -18,8 +18,9 @@ HISTORY_NOISE: Final = (0.0015, 0.006, 0.007, 0.02, 0.07, 0.07, 0.02, 0.04)
 0.02 rad/s."""
 JITTERED: Final = 0.5
 """Share of the agents whose maps are moved."""
-MAX_TURN_RAD: Final = 0.05
-MAX_SHIFT_M: Final = 0.4
+MAX_TURN_RAD: Final = 0.015
+"""More would teach that a map does not say where a road is 60 m ahead: 0.05 rad are 3 m there."""
+MAX_SHIFT_M: Final = 0.25
 NO_DIVIDERS: Final = 0.1
 """Share of the agents whose maps lack a layer of dividers, each of the two: many maps have none."""
 _MAPS = {"map": NEAR, "far_map": FAR}

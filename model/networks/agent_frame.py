@@ -352,9 +352,42 @@ def _in_the_way(path: Path, features: Features) -> Tensor:
     Between one read step and the next, in the frame of the path there: whether a neighbour lies on the path,
     narrowly and widely, and how near ahead of it one is.
     """
-    x, y, heading, _ = path
     neighbors = features["neighbors"]
-    steps = torch.arange(_READ_EVERY, STEPS + 1, _READ_EVERY, dtype=x.dtype, device=x.device)
+    ahead, aside, gone = _beside(path, neighbors, _READ_EVERY)
+    there = (neighbors[..., -1] > 0)[:, None, :, None].to(ahead.dtype)
+    passed = _reached(ahead, gone) * there
+    narrow, wide = ((-aside.square() / (2 * width**2)).exp() for width in (_NARROW_M, _WIDE_M))
+    following = torch.sigmoid(ahead + _HALF_LENGTH_M) * (-F.relu(ahead) / _GAP_M).exp() * there
+    met = (narrow * passed, wide * passed, narrow * following)
+    return torch.stack([one.amax(dim=2) for one in met], dim=-1)
+
+
+def drives_through(path: Path, neighbors: Tensor) -> Tensor:
+    """Return how nearly each mode drives through each neighbour that goes on as now: [N, K, M], 0 to 1.
+
+    Args:
+        path: of all steps.
+        neighbors: [N, M, 11]; where nobody is, nothing is said.
+    """
+    ahead, aside, gone = _beside(path, neighbors, 1)
+    through: Tensor = ((-aside.square() / (2 * _NARROW_M**2)).exp() * _reached(ahead, gone)).amax(dim=-1)
+    return through
+
+
+def _beside(path: Path, neighbors: Tensor, every: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return where neighbours are beside a path if they go on as now, in its frame at each of its steps.
+
+    Args:
+        path: at each ``every``-th step.
+        neighbors: [N, M, 11].
+        every: steps of 0.5 s from one of the path's to the next.
+
+    Returns:
+        m ahead and m to the left: [N, K, M, T'] each; m that the path went since the step before:
+        [N, K, 1, T'].
+    """
+    x, y, heading, _ = path
+    steps = torch.arange(every, STEPS + 1, every, dtype=x.dtype, device=x.device)
     seconds = STEP_SECONDS * steps
     position = NEIGHBOR_POSITION_SCALE * neighbors[:, :, None, 0:2]
     place = (
@@ -363,14 +396,13 @@ def _in_the_way(path: Path, features: Features) -> Tensor:
     east = place[:, None, ..., 0] - x[:, :, None]  # [N, K, M, T']
     north = place[:, None, ..., 1] - y[:, :, None]
     cos, sin = heading.cos()[:, :, None], heading.sin()[:, :, None]
-    ahead, aside = cos * east + sin * north, cos * north - sin * east
     gone = torch.hypot(
         torch.diff(x, prepend=torch.zeros_like(x[..., :1])),
         torch.diff(y, prepend=torch.zeros_like(y[..., :1])),
-    )[:, :, None]
-    there = (neighbors[..., -1] > 0)[:, None, :, None].to(x.dtype)
-    passed = torch.sigmoid(ahead + gone + _HALF_LENGTH_M) * torch.sigmoid(_HALF_LENGTH_M - ahead) * there
-    narrow, wide = ((-aside.square() / (2 * width**2)).exp() for width in (_NARROW_M, _WIDE_M))
-    following = torch.sigmoid(ahead + _HALF_LENGTH_M) * (-F.relu(ahead) / _GAP_M).exp() * there
-    met = (narrow * passed, wide * passed, narrow * following)
-    return torch.stack([one.amax(dim=2) for one in met], dim=-1)
+    )[:, :, None].detach()  # a length has no gradient at zero
+    return cos * east + sin * north, cos * north - sin * east, gone
+
+
+def _reached(ahead: Tensor, gone: Tensor) -> Tensor:
+    """Return whether a neighbour is met between a step and the one before: near 1 where it is."""
+    return torch.sigmoid(ahead + gone + _HALF_LENGTH_M) * torch.sigmoid(_HALF_LENGTH_M - ahead)

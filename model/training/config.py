@@ -100,11 +100,10 @@ class TrainingConfig(BaseModel):
     curved_copies: int = Field(default=2, ge=1)
     """How often an epoch shows a pair whose path is curved."""
     leaving_share: float = Field(default=1.0, ge=0, le=1)
-    """Share of the pairs that stood for 2 s and leave within 3 s that an epoch shows. The prediction
-    challenge picks what moves: of its pairs that stood two in five leave, of everyday standing cars one in a
-    hundred."""
+    """Share of the pairs that stood and leave within 6 s that an epoch shows. The prediction challenge picks
+    what moves: of its pairs that stood every one leaves, of everyday standing cars one in sixty."""
     staying_copies: int = Field(default=1, ge=1)
-    """How often an epoch shows a pair that stood for 2 s and is there after 3 s."""
+    """How often an epoch shows a pair that stood and is there after 6 s."""
     seed: int = 0
     variants: int = Field(default=0, ge=0)
     """V, noisy reports of each training pair (``model.data.sensing``) that are drawn from beside the recorded

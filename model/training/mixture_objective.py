@@ -15,11 +15,18 @@ import torch.nn.functional as F
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
+from model.agent_features import NEIGHBOR_VELOCITY_SCALE
 from model.forecaster import Context, Features
-from model.networks.agent_frame import AgentFrameNetwork, Modes, Path, read_patch
+from model.networks.agent_frame import AgentFrameNetwork, Modes, Path, drives_through, read_patch
 from model.raster import FAR
 from model.training.elbo import divergence
 from model.training.objectives import Loss
+
+
+_LEFT = 0.2
+"""A neighbour that the truth goes through more nearly than that did not stay where it was."""
+STANDING_MPS = 0.5
+"""A neighbour that is slower stands."""
 
 
 class MixtureWeights(BaseModel):
@@ -46,7 +53,9 @@ class MixtureWeights(BaseModel):
     expected: float = Field(default=1.0, ge=0)
     """1/m, of the mean distance expected under p(z | x)."""
     off_road: float = Field(default=0.0, ge=0)
-    """Of the share of the steps off the road, expected under p(z | x)."""
+    """Of the probability of the modes that leave the road at any step."""
+    collision: float = Field(default=0.0, ge=0)
+    """Of the probability of the modes that drive through a neighbour that stands."""
     proposal: float = Field(default=0.5, ge=0)
     """Of the distances of the proposals, beside those of the refined modes."""
     blind: float = Field(default=1.0, ge=0)
@@ -133,10 +142,29 @@ def _terms(
         named["choice"] = choice
     if weights.off_road and context is Context.FULL and "far_map" in features:
         road = read_patch(features["far_map"], modes.path.x, modes.path.y, FAR)[:, 0]
-        off = (log_weights.exp() * F.relu(-road).mean(dim=-1)).sum(dim=1).mean()
+        off = (log_weights.exp() * F.relu(-road).amax(dim=-1)).sum(dim=1).mean()
         value = value + weights.off_road * off
         named["off_road"] = off
+    if weights.collision and context is Context.FULL and "neighbors" in features:
+        met = _meets_standing(modes.path, future, features["neighbors"])
+        collision = (log_weights.exp() * met).sum(dim=1).mean()
+        value = value + weights.collision * collision
+        named["collision"] = collision
     return _Terms(value, {name: term.detach() for name, term in named.items()}, log_weights)
+
+
+def _meets_standing(path: Path, future: Tensor, neighbors: Tensor) -> Tensor:
+    """Return how nearly each mode drives through a neighbour that stands: [N, K], 0 to 1.
+
+    Neighbours that the true path goes through do not count: they left.
+    """
+    x, y = future[:, None].unbind(-1)
+    moved_x, moved_y = (torch.diff(part, prepend=torch.zeros_like(part[..., :1])) for part in (x, y))
+    truth = Path(x, y, torch.atan2(moved_y, moved_x), torch.zeros_like(x))
+    left = drives_through(truth, neighbors) > _LEFT
+    speed = NEIGHBOR_VELOCITY_SCALE * neighbors[..., 4:6].norm(dim=-1)
+    stands = (neighbors[..., -1] > 0) & (speed < STANDING_MPS) & ~left[:, 0]
+    return (drives_through(path, neighbors) * stands[:, None]).amax(dim=-1)
 
 
 def step_log_density(network: AgentFrameNetwork, modes: Modes, future: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
+from model.agent_features import NEIGHBOR_POSITION_SCALE, NEIGHBOR_VELOCITY_SCALE
 from model.bench import features_in_agent_frame
 from model.forecaster import Context, Features
 from model.networks.agent_frame import STEPS, AgentFrameNetwork
@@ -149,3 +150,45 @@ def test_a_part_of_the_batch_may_be_forecast_blindly(
         "nll_blind"
     ]
     assert part.item() == pytest.approx(whole.item(), rel=1e-5)
+
+
+def with_one_neighbor(features: Features, x: float, y: float, vx: float) -> Features:
+    """Features in which everyone's only neighbour is at that place, m and m/s in the own frame."""
+    neighbors = torch.zeros_like(features["neighbors"])
+    neighbors[:, 0, 0], neighbors[:, 0, 1] = x / NEIGHBOR_POSITION_SCALE, y / NEIGHBOR_POSITION_SCALE
+    neighbors[:, 0, 4] = vx / NEIGHBOR_VELOCITY_SCALE
+    neighbors[:, 0, 2] = neighbors[:, 0, 8] = neighbors[:, 0, 10] = 1.0
+    return features | {"neighbors": neighbors}
+
+
+def test_collision_is_the_probability_of_driving_through_what_stands(
+    network: AgentFrameNetwork, features: Features
+) -> None:
+    with torch.no_grad():
+        for head in (network.propose, network.refine):
+            head.weight.zero_()
+            head.bias.zero_()
+    features = features | {"speed": torch.full((5,), 10.0)}  # straight on, by every mode
+    ahead = torch.stack([5.0 * torch.arange(1, STEPS + 1), torch.zeros(STEPS)], dim=-1)
+    stops = torch.minimum(ahead, ahead.new_tensor([14.0, 0.0]))
+
+    def collision(x: float, y: float, vx: float, future: Tensor) -> float:
+        met = with_one_neighbor(features, x, y, vx)
+        with torch.no_grad():
+            return value(network, met, future.expand(5, STEPS, 2), only(collision=1.0)).item()
+
+    assert collision(24.0, 0.0, 0.0, stops) > 0.9
+    assert 0.2 < collision(24.0, 1.5, 0.0, stops) < 0.6  # half in the lane
+    assert collision(24.0, 3.5, 0.0, stops) < 0.03  # in the next lane
+    assert collision(-9.0, 0.0, 0.0, stops) < 0.05  # behind
+    assert collision(24.0, 0.0, 4.0, stops) == 0.0  # it drives
+    assert collision(24.0, 0.0, 0.0, ahead) == 0.0  # it left: the truth goes there
+
+
+def test_collision_moves_paths_and_probabilities(network: AgentFrameNetwork, features: Features) -> None:
+    met = with_one_neighbor(features | {"speed": torch.full((5,), 10.0)}, 25.0, 0.0, 0.0)
+    value(network, met, torch.zeros(5, STEPS, 2), only(collision=1.0)).backward()
+    for head in (network.propose, network.mode_logits):
+        assert head.weight.grad is not None
+        assert torch.isfinite(head.weight.grad).all()
+        assert head.weight.grad.abs().max() > 0
