@@ -22,7 +22,6 @@ from model.raster import FAR
 from model.training.elbo import divergence
 from model.training.objectives import Loss
 
-
 _LEFT = 0.2
 """A neighbour that the truth goes through more nearly than that did not stay where it was."""
 STANDING_MPS = 0.5
@@ -164,7 +163,8 @@ def _meets_standing(path: Path, future: Tensor, neighbors: Tensor) -> Tensor:
     left = drives_through(truth, neighbors) > _LEFT
     speed = NEIGHBOR_VELOCITY_SCALE * neighbors[..., 4:6].norm(dim=-1)
     stands = (neighbors[..., -1] > 0) & (speed < STANDING_MPS) & ~left[:, 0]
-    return (drives_through(path, neighbors) * stands[:, None]).amax(dim=-1)
+    met: Tensor = (drives_through(path, neighbors) * stands[:, None]).amax(dim=-1)
+    return met
 
 
 def step_log_density(network: AgentFrameNetwork, modes: Modes, future: Tensor) -> Tensor:

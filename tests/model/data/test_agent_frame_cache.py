@@ -1,6 +1,7 @@
 """Caches and batches in the agents' frames, with variants and over several sources."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,10 @@ from model.data.cache import Cache, build_cache
 from model.data.caches import open_cache
 from model.data.packing import unpack_patches
 from model.data.protocols import frame_scene
-from model.data.scenes import DataError, SceneRecord
+from model.data.scenes import DataError, Pair, SceneRecord, Track
 from model.forecaster import Context, Protocol
 from model.networks.config import Frame, NetworkConfig
+from model.scene import AgentType
 from tests.model.data.records import FixedReader, record
 
 CONFIG = NetworkConfig(frame=Frame.AGENT, far_map=True)
@@ -81,6 +83,23 @@ def test_a_batch_draws_among_the_rows_of_its_pairs(tmp_path: Path) -> None:
     torch.manual_seed(5)
     again, _ = batches.batch(torch.arange(8))
     assert torch.equal(one["origin"], again["origin"])
+
+
+def test_who_stood_and_left_is_known_from_the_whole_pair(tmp_path: Path) -> None:
+    """Tracks of one pair each, asked about at frame 4: seen since a frame, standing until one, then driving."""
+    made_up = [(0, 99), (0, 14), (0, 6), (3, 99), (3, 6), (0, 2)]
+    tracks = []
+    for number, (seen, until) in enumerate(made_up):
+        frames = np.arange(seen, 17)
+        x = 2.0 * np.maximum(frames - until, 0)
+        position = np.stack([x, np.full(len(frames), 10.0 * number)], axis=1)
+        tracks.append(Track(str(number), AgentType.VEHICLE, frames, position, np.zeros(len(frames))))
+    pairs = [Pair(number, 4) for number in range(len(tracks))]
+    one = replace(RECORDS[0], tracks=tracks, pairs=pairs)
+    for variants in (0, VARIANTS):
+        batches = Batches(made(tmp_path / str(variants), variants, (one,)), CPU, CONFIG)
+        assert batches.leaving.tolist() == [False, True, True, False, True, False]
+        assert batches.staying.tolist() == [True, False, False, True, False, False]
 
 
 def test_sources_are_joined_in_the_order_that_is_asked(tmp_path: Path) -> None:
