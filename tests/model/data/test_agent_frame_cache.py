@@ -86,7 +86,7 @@ def test_a_batch_draws_among_the_rows_of_its_pairs(tmp_path: Path) -> None:
 
 
 def test_who_stood_and_left_is_known_from_the_whole_pair(tmp_path: Path) -> None:
-    """Tracks of one pair each, asked about at frame 4: seen since a frame, standing until one, then driving."""
+    """Tracks asked about at frame 4 that are seen since a frame, stand until another, and then drive."""
     made_up = [(0, 99), (0, 14), (0, 6), (3, 99), (3, 6), (0, 2)]
     tracks = []
     for number, (seen, until) in enumerate(made_up):
