@@ -100,8 +100,9 @@ class TrainingConfig(BaseModel):
     curved_copies: int = Field(default=2, ge=1)
     """How often an epoch shows a pair whose path is curved."""
     leaving_share: float = Field(default=1.0, ge=0, le=1)
-    """Share of the pairs that stood and leave within 6 s that an epoch shows. The prediction challenge picks
-    what moves: of its pairs that stood every one leaves, of everyday standing cars one in sixty."""
+    """Share of the pairs that stood and leave within 6 s that are shown as they are; the others stay
+    (``model.data.holdups``). The prediction challenge picks what moves: of its pairs that stood every one
+    leaves, of everyday standing cars one in sixty."""
     staying_copies: int = Field(default=1, ge=1)
     """How often an epoch shows a pair that stood and is there after 6 s."""
     seed: int = 0
@@ -110,6 +111,9 @@ class TrainingConfig(BaseModel):
     states; in the agent's frame only."""
     hide: bool = False
     """Take map and neighbours away at random (``model.data.hiding``); in the agent's frame only."""
+    block: bool = False
+    """Put somebody who stands beyond where some agents went (``model.data.holdups``); in the agent's frame,
+    with neighbours."""
     jitter: bool = False
     """Move histories and maps a little each time (``model.data.jittering``); in the agent's frame only."""
     weight_decay: float = Field(default=0.0, ge=0)
@@ -138,11 +142,15 @@ class TrainingConfig(BaseModel):
     @model_validator(mode="after")
     def _suits_the_frame(self) -> "TrainingConfig":
         if not self.in_agent_frame:
-            if self.variants or self.hide or self.jitter or self.mixture != MixtureWeights():
-                raise ValueError("variants, hide, jitter and mixture are for networks of the agent's frame")
+            if self.variants or self.hide or self.block or self.jitter or self.mixture != MixtureWeights():
+                raise ValueError(
+                    "variants, hide, block, jitter and mixture are for networks of the agent's frame"
+                )
             return self
         if self.method not in _IN_AGENT_FRAME:
             raise ValueError(f"frame: {self.method.value} does not learn in the agent's frame")
+        if self.block and isinstance(self.network, NetworkConfig) and not self.network.neighbor_types:
+            raise ValueError("block: the network sees no neighbours")
         if self.rotate:
             raise ValueError("rotate: in the agent's frame a scene that is turned is the same scene")
         return self

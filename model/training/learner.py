@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from model.cvae import CvaeNetworks
 from model.data.hiding import hide_context
+from model.data.holdups import block
 from model.data.jittering import jitter
 from model.data.packing import unpack_patches
 from model.forecaster import Features
@@ -160,16 +161,18 @@ class AgentFrameLearner(DescentLearner):
         self._weights = config.mixture
         self._contrast = config.method is Method.CAB
         self._hide = config.hide
+        self._block = config.block
         self._jitter = config.jitter
 
     def step(self, batches: Sequence[Batch], weights: Weights, rate: float) -> dict[str, Tensor]:
         (batch,) = batches
-        features = dict(hide_context(batch.features) if self._hide else batch.features)
+        future = turned(batch.future, -batch.features["heading"].to(batch.future.dtype))
+        features = block(batch.features, future) if self._block else batch.features
+        features = dict(hide_context(features) if self._hide else features)
         for name in features.keys() & {"map", "far_map"}:
             features[name] = unpack_patches(features[name])
         if self._jitter:
             features = jitter(features)
-        future = turned(batch.future, -features["heading"].to(batch.future.dtype))
         loss = mixture_objective(self.network, features, future, self._weights, self._contrast)
         self.descend(loss.value, rate)
         return logged(loss)

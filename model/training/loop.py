@@ -12,6 +12,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
+from model.data.holdups import hold
 from model.data.mirroring import mirror
 from model.network_forecaster import Networks
 from model.training import processes
@@ -163,8 +164,6 @@ class Trainer:
             config.curved_copies,
             config.seed,
             epoch,
-            train.leaving,
-            config.leaving_share,
             train.staying,
             config.staying_copies,
         )
@@ -177,7 +176,10 @@ class Trainer:
         turns = random_turns(len(indices), generator) if self.config.rotate else None
         sides = random_sides(len(indices), generator) if self.config.mirror else None
         mine = slice(processes.rank(), None, processes.world())
-        batch = Batch(*self._train.batch(indices[mine], None if turns is None else turns[mine]))
+        features, future = self._train.batch(indices[mine], None if turns is None else turns[mine])
+        if self.config.leaving_share < 1:
+            future = hold(future, self._train.leaving[indices[mine]], self.config.leaving_share, generator)
+        batch = Batch(features, future)
         return batch if sides is None else Batch(*mirror(*batch, sides[mine].to(self._device)))
 
     def _step(self, batches: Sequence[Batch]) -> dict[str, Tensor]:

@@ -12,8 +12,6 @@ def epoch_order(
     curved_copies: int,
     seed: int,
     epoch: int,
-    leaving: Tensor | None = None,
-    leaving_share: float = 1.0,
     staying: Tensor | None = None,
     staying_copies: int = 1,
 ) -> Tensor:
@@ -26,8 +24,6 @@ def epoch_order(
         curved_copies: how often a curved one comes.
         seed: of the run.
         epoch: counted from 0; each has its own order.
-        leaving: [P] bool, pairs that stood and leave; None: there are none.
-        leaving_share: how many of these the epoch shows, drawn anew for each.
         staying: [P] bool, pairs that stood and stay; None: there are none.
         staying_copies: how often these come.
     """
@@ -37,10 +33,6 @@ def epoch_order(
     shown = torch.cat([indices, curved.repeat(curved_copies - 1)])
     if staying is not None:
         shown = torch.cat([shown, indices[staying].repeat(staying_copies - 1)])
-    if leaving is not None and leaving_share < 1:
-        some = shown[leaving[shown]]
-        kept = some[torch.randperm(len(some), generator=generator)[: int(leaving_share * len(some))]]
-        shown = torch.cat([shown[~leaving[shown]], kept])
     return shown[torch.randperm(len(shown), generator=generator)]
 
 
