@@ -181,6 +181,33 @@ def test_about_half_of_the_agents_are_mirrored_if_asked(
     )
 
 
+def test_those_who_stood_and_leave_are_shown_as_staying(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Leaving(MadeUpPairs):
+        @property
+        def leaving(self) -> Tensor:
+            return torch.arange(len(self)) % 2 == 0
+
+    config = small_config(Method.TRAJECTRON, epochs=1, leaving_share=0.0, mirror=False, rotate=False)
+    pairs = Leaving(len(PAIRS))
+    trainer = Trainer(config, pairs, validate, tmp_path, torch.device("cpu"))
+    seen: list[Batch] = []
+
+    def watch(batches: Sequence[Batch], weights: Weights, rate: float) -> dict[str, Tensor]:
+        seen.extend(batches)
+        return {}
+
+    monkeypatch.setattr(trainer.learner, "step", watch)
+    trainer.run(lambda progress, figures: None, lambda done, batches: None)
+    order = epoch_order(pairs.turned, config.curved_copies, config.seed, epoch=0)
+    got = torch.cat([batch.future for batch in seen])
+    order = order[: len(got)]
+    stays = (got == 0).flatten(1).all(dim=1)
+    assert torch.equal(stays, pairs.leaving[order])
+    assert torch.equal(got[~stays], pairs.batch(order)[1][~stays])
+
+
 def test_a_run_begins_with_the_parameters_that_it_is_given(tmp_path: Path) -> None:
     first, _ = train(small_config(Method.TRAJECTRON, epochs=1), tmp_path / "first")
     given = dict(first.networks.state_dict())

@@ -156,6 +156,7 @@ def test_a_run_in_the_agents_frame_on_several_sources(run: Run, method: Method) 
         mirror=True,
         variants=1,
         hide=True,
+        block=True,
         jitter=True,
         keep="last",
         weight_decay=0.01,
