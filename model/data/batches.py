@@ -16,6 +16,7 @@ from model.data.rotation import rotate
 from model.data.scenes import DataError
 from model.forecaster import Features
 from model.geometry import rotate as rotate_vectors
+from model.metrics.standing import stood
 from model.networks.config import AnyNetworkConfig, NetworkConfig
 from model.scene import AgentType
 from model.standardization import state_scale
@@ -82,8 +83,9 @@ class Batches:
         future, heading = cache.future[recorded], cache.heading[recorded]
         paths = rotate_vectors(future.astype(np.float64), -heading[:, None])
         self._paths = torch.from_numpy(paths.astype(np.float32))
-        stood, left = _stood_and_left(cache)
-        self._leaving, self._staying = torch.from_numpy(stood & left), torch.from_numpy(stood & ~left)
+        standing, left = _stood_and_left(cache)
+        self._leaving = torch.from_numpy(standing & left)
+        self._staying = torch.from_numpy(standing & ~left)
         looks = config is None or config.looks_at_map(AgentType.VEHICLE)
         self._cut = PatchCutter(cache, device) if looks and not key.agent_frame else None
         self._device = device
@@ -99,12 +101,12 @@ class Batches:
 
     @property
     def leaving(self) -> Tensor:
-        """[P] bool, pairs that stood for as long as they were seen and leave within 6 s; on the CPU."""
+        """[P] bool, pairs that stood for 2 s and leave within 6 s; on the CPU."""
         return self._leaving
 
     @property
     def staying(self) -> Tensor:
-        """[P] bool, pairs that stood for as long as they were seen and are there after 6 s; on the CPU."""
+        """[P] bool, pairs that stood for 2 s and are there after 6 s; on the CPU."""
         return self._staying
 
     @property
@@ -147,8 +149,6 @@ class Batches:
         return features, self._future.index_select(0, indices)
 
 
-STOOD_M = 0.5
-"""m; who moved less over the whole observed history stood."""
 LEFT_M = 2.0
 """m; who is farther away than that after 6 s has left."""
 RECORDED_SHARE = 0.4
@@ -156,20 +156,18 @@ RECORDED_SHARE = 0.4
 
 
 def _stood_and_left(cache: Cache) -> tuple[Bools, Bools]:
-    """Return which pairs stood for as long as they were seen, and which are elsewhere after 6 s: [P] each.
+    """Return which pairs stood for 2 s, and which are elsewhere after 6 s: [P] each.
 
-    Who was seen in one frame only does not count: it may be driving. The end counts, because the prediction
-    challenge has no pair that stands to the end: those that are still there after 3 s are about to leave.
+    The end counts, because the prediction challenge has no pair that stands to the end: those that are still
+    there after 3 s are about to leave.
     """
     rows = slice(None, None, 1 + cache.manifest.key.variants)
     scale = HISTORY_SCALE if cache.manifest.key.agent_frame else _GROUND_SCALE
-    first = cache.first[rows]
     before = cache.history[rows, :, :2] * scale[:2]
-    frames = before.shape[1]
-    distance = np.where(np.arange(frames) >= first[:, None], np.hypot(before[..., 0], before[..., 1]), 0.0)
+    seen = np.arange(before.shape[1]) >= cache.first[rows][:, None]
     end = cache.future[rows, -1]
-    stood = (first < frames - 1) & (distance.max(axis=1) < STOOD_M)
-    return np.asarray(stood), np.asarray(np.hypot(end[:, 0], end[:, 1]) > LEFT_M)
+    left = np.hypot(end[:, 0], end[:, 1]) > LEFT_M
+    return stood(np.where(seen[..., None], before, np.nan)), np.asarray(left)
 
 
 _GROUND_SCALE = state_scale(AgentType.VEHICLE, AgentType.VEHICLE)
