@@ -83,9 +83,7 @@ class Batches:
         future, heading = cache.future[recorded], cache.heading[recorded]
         paths = rotate_vectors(future.astype(np.float64), -heading[:, None])
         self._paths = torch.from_numpy(paths.astype(np.float32))
-        standing, left = _stood_and_left(cache)
-        self._leaving = torch.from_numpy(standing & left)
-        self._staying = torch.from_numpy(standing & ~left)
+        self._leaving = torch.from_numpy(_leaving(cache))
         looks = config is None or config.looks_at_map(AgentType.VEHICLE)
         self._cut = PatchCutter(cache, device) if looks and not key.agent_frame else None
         self._device = device
@@ -103,11 +101,6 @@ class Batches:
     def leaving(self) -> Tensor:
         """[P] bool, pairs that stood for 2 s and leave within 6 s; on the CPU."""
         return self._leaving
-
-    @property
-    def staying(self) -> Tensor:
-        """[P] bool, pairs that stood for 2 s and are there after 6 s; on the CPU."""
-        return self._staying
 
     @property
     def paths(self) -> Tensor:
@@ -155,8 +148,8 @@ RECORDED_SHARE = 0.4
 """Of the pairs with variants that are shown as recorded."""
 
 
-def _stood_and_left(cache: Cache) -> tuple[Bools, Bools]:
-    """Return which pairs stood for 2 s, and which are elsewhere after 6 s: [P] each.
+def _leaving(cache: Cache) -> Bools:
+    """Return which pairs stood for 2 s and are elsewhere after 6 s: [P].
 
     The end counts, because the prediction challenge has no pair that stands to the end: those that are still
     there after 3 s are about to leave.
@@ -167,7 +160,7 @@ def _stood_and_left(cache: Cache) -> tuple[Bools, Bools]:
     seen = np.arange(before.shape[1]) >= cache.first[rows][:, None]
     end = cache.future[rows, -1]
     left = np.hypot(end[:, 0], end[:, 1]) > LEFT_M
-    return stood(np.where(seen[..., None], before, np.nan)), np.asarray(left)
+    return np.asarray(stood(np.where(seen[..., None], before, np.nan)) & left)
 
 
 _GROUND_SCALE = state_scale(AgentType.VEHICLE, AgentType.VEHICLE)
@@ -205,11 +198,6 @@ class JoinedPairs:
     def leaving(self) -> Tensor:
         """[P], as of ``Batches``."""
         return torch.cat([one.leaving for one in self._sources])
-
-    @property
-    def staying(self) -> Tensor:
-        """[P], as of ``Batches``."""
-        return torch.cat([one.staying for one in self._sources])
 
     @property
     def paths(self) -> Tensor:

@@ -103,8 +103,6 @@ class TrainingConfig(BaseModel):
     """Share of the pairs that stood and leave within 6 s that are shown as they are; the others stay
     (``model.data.holdups``). The prediction challenge picks what moves: of its pairs that stood every one
     leaves, of everyday standing cars one in sixty."""
-    staying_copies: int = Field(default=1, ge=1)
-    """How often an epoch shows a pair that stood and is there after 6 s."""
     seed: int = 0
     variants: int = Field(default=0, ge=0)
     """V, noisy reports of each training pair (``model.data.sensing``) that are drawn from beside the recorded

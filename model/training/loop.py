@@ -164,8 +164,6 @@ class Trainer:
             config.curved_copies,
             config.seed,
             epoch,
-            train.staying,
-            config.staying_copies,
         )
 
     def _batch(self, order: Tensor, number: int, size: int, generator: torch.Generator) -> Batch:

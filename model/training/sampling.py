@@ -12,8 +12,6 @@ def epoch_order(
     curved_copies: int,
     seed: int,
     epoch: int,
-    staying: Tensor | None = None,
-    staying_copies: int = 1,
 ) -> Tensor:
     """Indices of the pairs in the epoch's order; pairs of curved paths come several times.
 
@@ -24,15 +22,11 @@ def epoch_order(
         curved_copies: how often a curved one comes.
         seed: of the run.
         epoch: counted from 0; each has its own order.
-        staying: [P] bool, pairs that stood and stay; None: there are none.
-        staying_copies: how often these come.
     """
     generator = torch.Generator().manual_seed(epoch_seed(seed, epoch))
     indices = torch.arange(len(turned))
     curved = indices[turned.abs() > CURVED_RADIANS]
     shown = torch.cat([indices, curved.repeat(curved_copies - 1)])
-    if staying is not None:
-        shown = torch.cat([shown, indices[staying].repeat(staying_copies - 1)])
     return shown[torch.randperm(len(shown), generator=generator)]
 
 

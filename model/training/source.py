@@ -25,11 +25,6 @@ class BatchSource(Interface):
         ...
 
     @property
-    def staying(self) -> Tensor:
-        """[P] bool, pairs that stood for 2 s and are there after 6 s; on the CPU."""
-        ...
-
-    @property
     def paths(self) -> Tensor:
         """[P, T, 2], m, each pair's future in its agent's own frame: x ahead, y to the left; on the CPU."""
         ...

@@ -85,7 +85,7 @@ def test_a_batch_draws_among_the_rows_of_its_pairs(tmp_path: Path) -> None:
     assert torch.equal(one["origin"], again["origin"])
 
 
-def test_who_stood_and_left_is_known_from_the_whole_pair(tmp_path: Path) -> None:
+def test_who_stood_and_leaves_is_known_from_the_whole_pair(tmp_path: Path) -> None:
     """Tracks asked about at frame 4 that are seen since a frame, stand until another, and then drive."""
     made_up = [(0, 99), (0, 14), (0, 6), (3, 99), (3, 6), (0, 2)]
     tracks = []
@@ -99,7 +99,6 @@ def test_who_stood_and_left_is_known_from_the_whole_pair(tmp_path: Path) -> None
     for variants in (0, VARIANTS):
         batches = Batches(made(tmp_path / str(variants), variants, (one,)), CPU, CONFIG)
         assert batches.leaving.tolist() == [False, True, True, False, False, False]
-        assert batches.staying.tolist() == [True, False, False, False, False, False]
 
 
 def test_sources_are_joined_in_the_order_that_is_asked(tmp_path: Path) -> None:

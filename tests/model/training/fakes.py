@@ -35,11 +35,6 @@ class MadeUpPairs:
         return torch.zeros(len(self), dtype=torch.bool)
 
     @property
-    def staying(self) -> Tensor:
-        """[P], none."""
-        return torch.zeros(len(self), dtype=torch.bool)
-
-    @property
     def paths(self) -> Tensor:
         """[P, 12, 2], the futures in the agents' own frames."""
         return turned(self._future, -present_heading(self._features))
