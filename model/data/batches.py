@@ -16,7 +16,6 @@ from model.data.rotation import rotate
 from model.data.scenes import DataError
 from model.forecaster import Features
 from model.geometry import rotate as rotate_vectors
-from model.metrics.standing import stood
 from model.networks.config import AnyNetworkConfig, NetworkConfig
 from model.scene import AgentType
 from model.standardization import state_scale
@@ -99,7 +98,7 @@ class Batches:
 
     @property
     def leaving(self) -> Tensor:
-        """[P] bool, pairs that stood for 2 s and leave within 6 s; on the CPU."""
+        """[P] bool, pairs that stood for as long as they were seen and leave within 6 s; on the CPU."""
         return self._leaving
 
     @property
@@ -142,6 +141,9 @@ class Batches:
         return features, self._future.index_select(0, indices)
 
 
+STOOD_M = 0.5
+"""m; who moved less for as long as it was seen stood. That is more than the metrics count
+(``model.metrics.standing``): who was seen for less than 2 s, or from farther away, may stand, too."""
 LEFT_M = 2.0
 """m; who is farther away than that after 6 s has left."""
 RECORDED_SHARE = 0.4
@@ -149,18 +151,20 @@ RECORDED_SHARE = 0.4
 
 
 def _leaving(cache: Cache) -> Bools:
-    """Return which pairs stood for 2 s and are elsewhere after 6 s: [P].
+    """Return which pairs stood for as long as they were seen, and are elsewhere after 6 s: [P].
 
     The end counts, because the prediction challenge has no pair that stands to the end: those that are still
-    there after 3 s are about to leave.
+    there after 3 s are about to leave. Who was seen in one frame only does not count: it may be driving.
     """
     rows = slice(None, None, 1 + cache.manifest.key.variants)
     scale = HISTORY_SCALE if cache.manifest.key.agent_frame else _GROUND_SCALE
+    first = cache.first[rows]
     before = cache.history[rows, :, :2] * scale[:2]
-    seen = np.arange(before.shape[1]) >= cache.first[rows][:, None]
+    frames = before.shape[1]
+    distance = np.where(np.arange(frames) >= first[:, None], np.hypot(before[..., 0], before[..., 1]), 0.0)
     end = cache.future[rows, -1]
-    left = np.hypot(end[:, 0], end[:, 1]) > LEFT_M
-    return np.asarray(stood(np.where(seen[..., None], before, np.nan)) & left)
+    stood = (first < frames - 1) & (distance.max(axis=1) < STOOD_M)
+    return np.asarray(stood & (np.hypot(end[:, 0], end[:, 1]) > LEFT_M))
 
 
 _GROUND_SCALE = state_scale(AgentType.VEHICLE, AgentType.VEHICLE)

@@ -12,7 +12,7 @@ from torch import Tensor
 from model.agent_features import NEIGHBOR_POSITION_SCALE, NEIGHBOR_REACH_M
 from model.forecaster import Features
 
-BLOCKED: Final = 0.2
+BLOCKED: Final = 0.12
 """Share of the agents that get somebody standing beyond where they went."""
 GAP_M: Final = (6.0, 40.0)
 """m from the end of a path to who stands there, along its last direction: a car's length and more."""
@@ -23,7 +23,7 @@ ASIDE_M: Final = 0.5
 def hold(future: Tensor, leaving: Tensor, share: float, generator: torch.Generator) -> Tensor:
     """Return futures in which most of those who stood and leave stay.
 
-    Who stood for 2 s had mostly stood before: an earlier pair of the same agent, with the same
+    Who stood for as long as it was seen had mostly stood before: an earlier pair of the same agent, with the same
     history, ends where it began. The challenge left it out.
 
     Args:

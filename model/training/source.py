@@ -21,7 +21,7 @@ class BatchSource(Interface):
 
     @property
     def leaving(self) -> Tensor:
-        """[P] bool, pairs that stood for 2 s and leave within 6 s; on the CPU."""
+        """[P] bool, pairs that stood for as long as they were seen and leave within 6 s; on the CPU."""
         ...
 
     @property

@@ -98,7 +98,7 @@ def test_who_stood_and_leaves_is_known_from_the_whole_pair(tmp_path: Path) -> No
     one = replace(RECORDS[0], tracks=tracks, pairs=pairs)
     for variants in (0, VARIANTS):
         batches = Batches(made(tmp_path / str(variants), variants, (one,)), CPU, CONFIG)
-        assert batches.leaving.tolist() == [False, True, True, False, False, False]
+        assert batches.leaving.tolist() == [False, True, True, False, True, False]
 
 
 def test_sources_are_joined_in_the_order_that_is_asked(tmp_path: Path) -> None:
