@@ -23,8 +23,8 @@ ASIDE_M: Final = 0.5
 def hold(future: Tensor, leaving: Tensor, share: float, generator: torch.Generator) -> Tensor:
     """Return futures in which most of those who stood and leave stay.
 
-    Who stood for as long as it was seen had mostly stood before: an earlier pair of the same agent, with the same
-    history, ends where it began. The challenge left it out.
+    Who stood for as long as it was seen had mostly stood before: an earlier pair of the same agent, with the
+    same history, ends where it began. The challenge left it out.
 
     Args:
         future: [N, T, 2], m, relative to now.

@@ -5,12 +5,45 @@ matter of this list.
 """
 
 OUTSIDE: dict[str, frozenset[str]] = {
-    "row": frozenset(),
+    "row": frozenset(
+        {
+            "sideways 2 cm/s, 2 Hz",
+            "sideways -2 cm/s",
+            "straight 9",
+            "straight 12, 20 Hz",
+            "straight 9, 8 cm, 20 Hz",
+            "jitter 30 ms",
+            "highway 37",
+            "accelerating 2.2",
+            "braking 2.7",
+            "junction in 22 m",
+            "junction in 30 m",
+            "lead in 24 m",
+            "lead in 29 m",
+        }
+    ),
     "width": frozenset(),
     "modes": frozenset(),
-    "shared row": frozenset(),
+    "shared row": frozenset(
+        {
+            "standing_sideways_2cms",
+            "accelerating_2",
+            "braking_3",
+            "curve_R55_entry",
+            "lead_stands",
+        }
+    ),
     "shared modes": frozenset(),
-    "drive": frozenset(),
-    "turned": frozenset(),
+    "drive": frozenset(
+        {
+            "100 ticks, straight on",
+            "100 ticks, into a curve",
+        }
+    ),
+    "turned": frozenset(
+        {
+            "raster",
+        }
+    ),
 }
 """Names of scenes, drives and views by what is asked of them."""
