@@ -53,6 +53,8 @@ _MAX_HEADING_CORRECTION = 0.3
 """rad; a given heading is noisy, so a path may begin that far beside it."""
 _MAX_SPEED_CORRECTION = 2.0
 """m/s; so is a velocity."""
+_DRIVES_AHEAD = 1.0
+"""m/s; who is faster does not go backwards within the 6 s that are decoded."""
 _READ_LATERAL_M = (-6.0, -3.5, -1.75, 0.0, 1.75, 3.5, 6.0)
 _READ_AHEAD_M = (0.0, 5.0)
 """Where the map is read around each position of a mode, m, in the frame of the path there."""
@@ -146,7 +148,7 @@ class Path(NamedTuple):
 
 
 def drive(controls: Tensor, heading: Tensor, speed: Tensor) -> Path:
-    """Return the paths of a unicycle, by the midpoint rule.
+    """Return the paths of a unicycle, by the midpoint rule; who drives ahead stops before it reverses.
 
     Args:
         controls: [N, K, T, 2], heading rate (rad/s) and acceleration (m/s²).
@@ -156,8 +158,9 @@ def drive(controls: Tensor, heading: Tensor, speed: Tensor) -> Path:
     dt = STEP_SECONDS
     turned, gained = (dt * controls.cumsum(dim=2)).unbind(-1)
     phi, v = heading[..., None] + turned, speed[..., None] + gained
-    rate, acceleration = controls.unbind(-1)
-    middle, mean_speed = phi - 0.5 * dt * rate, v - 0.5 * dt * acceleration
+    v = torch.where((speed > _DRIVES_AHEAD)[..., None], F.relu(v), v)
+    middle = phi - 0.5 * dt * controls[..., 0]
+    mean_speed = 0.5 * (torch.cat([speed[..., None], v[..., :-1]], dim=-1) + v)
     x = dt * (mean_speed * middle.cos()).cumsum(dim=2)
     y = dt * (mean_speed * middle.sin()).cumsum(dim=2)
     return Path(x, y, phi, v)

@@ -104,6 +104,15 @@ def test_a_steady_braking_is_a_parabola() -> None:
     torch.testing.assert_close(path.x[0, 0], 9 * seconds - seconds.square() / 2, atol=1e-4, rtol=0)
 
 
+def test_who_brakes_stops_and_who_reverses_goes_on() -> None:
+    controls = torch.tensor([0.0, -2.0]).expand(1, 2, STEPS, 2)
+    path = drive(controls, torch.zeros(1, 2), torch.tensor([[5.0, 0.5]]))
+    assert path.speed[0, 0, 5:].abs().max().item() == 0
+    assert path.x[0, 0, -1].item() == pytest.approx(5**2 / (2 * 2), abs=0.15)
+    assert path.x[0, 0].diff().min().item() == 0
+    assert path.speed[0, 1, -1].item() == pytest.approx(0.5 - 2 * 6, abs=1e-4)  # it stands: it may back out
+
+
 @pytest.mark.parametrize("geometry", [NEAR, FAR])
 def test_a_patch_is_read_where_its_pixels_lie(geometry: PatchGeometry) -> None:
     patch = torch.zeros(1, 3, 100, 100)
