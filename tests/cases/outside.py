@@ -7,15 +7,14 @@ matter of this list.
 OUTSIDE: dict[str, frozenset[str]] = {
     "row": frozenset(
         {
+            "standing, 1 cm, 5 Hz",
             "sideways 2 cm/s, 2 Hz",
             "sideways -2 cm/s",
             "straight 9",
             "straight 12, 20 Hz",
             "straight 9, 8 cm, 20 Hz",
-            "jitter 30 ms",
             "highway 37",
             "accelerating 2.2",
-            "braking 2.7",
             "junction in 22 m",
             "junction in 30 m",
             "lead in 24 m",
@@ -23,12 +22,16 @@ OUTSIDE: dict[str, frozenset[str]] = {
         }
     ),
     "width": frozenset(),
-    "modes": frozenset(),
+    "modes": frozenset(
+        {
+            "braking 2.7",
+        }
+    ),
     "shared row": frozenset(
         {
             "standing_sideways_2cms",
+            "highway_33",
             "accelerating_2",
-            "braking_3",
             "curve_R55_entry",
             "lead_stands",
         }
