@@ -63,7 +63,7 @@ def test_other_seeds_splits_and_numbers_are_other_data() -> None:
 
 def test_splits() -> None:
     reader = SyntheticReader(Path("7"))
-    assert reader.splits == ("train", "validation")
+    assert reader.splits == ("train", "validation", "hard")
     names = [scene.name for scene in reader.scenes("validation")]
     assert names == sorted(names)
     assert len(set(names)) == SCENES["validation"] == 60

@@ -316,26 +316,32 @@ def test_every_method_has_its_settings(method: Method) -> None:
 def test_every_method_is_trained_as_published_on_request(method: Method) -> None:
     ours, published = load_config(method), load_config(method, published=True)
     changed = {name for name, value in published.network if value != getattr(ours.network, name)}
-    assert changed == (set() if method is Method.COVERNET else {"max_control_sigma"})
+    if ours.in_agent_frame:
+        assert changed == {"frame"} | ({"far_map"} if ours.network.uses_map else set())
+    else:
+        assert changed == (set() if method is Method.COVERNET else {"max_control_sigma"})
+    assert not published.in_agent_frame
     assert getattr(published.network, "max_control_sigma", None) is None
     assert (published.kl_weight, published.apart_weight, published.epochs) == (100, 5, 40)
-    assert published.displacement_weight == 0 < ours.displacement_weight
-    assert published.rotate is ours.rotate
+    assert published.displacement_weight == 0
+    assert ours.displacement_weight > 0 or ours.mixture.expected > 0
+    assert published.rotate is (ours.in_agent_frame or ours.rotate)
     assert load_config(method, published=True, epochs=3).epochs == 3
-    changes = {"displacement_weight", "epochs", "cooldown_epochs", "averaging"}
+    changes = {"epochs", "cooldown_epochs", "averaging"}
+    changes |= {"mixture", "variants"} if ours.in_agent_frame else {"displacement_weight"}
     assert {name for name, value in published if value != getattr(ours, name)} >= changes
 
 
 def test_a_short_run_has_short_phases() -> None:
-    whole, short = load_config(Method.CAB), load_config(Method.CAB, epochs=3)
+    whole, short = load_config(Method.RUBIZ), load_config(Method.RUBIZ, epochs=3)
     assert whole.cooldown_epochs > 3
     assert whole.epochs_apart > 1
     assert (short.cooldown_epochs, short.epochs_apart) == (3, 1)
-    more = load_config(Method.CAB, epochs=whole.epochs + 1)
+    more = load_config(Method.RUBIZ, epochs=whole.epochs + 1)
     assert more == whole.model_copy(update={"epochs": whole.epochs + 1})
-    assert load_config(Method.CAB, epochs=3, cooldown_epochs=1).cooldown_epochs == 1
+    assert load_config(Method.RUBIZ, epochs=3, cooldown_epochs=1).cooldown_epochs == 1
     with pytest.raises(TrainingError, match="cooldown_epochs 4 is more than epochs 3"):
-        load_config(Method.CAB, epochs=3, cooldown_epochs=4)
+        load_config(Method.RUBIZ, epochs=3, cooldown_epochs=4)
 
 
 def test_the_released_learning_rates() -> None:
