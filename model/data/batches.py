@@ -6,7 +6,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.agent_features import HISTORY_SCALE
 from model.arrays import Bools
 from model.data.cache import Cache
 from model.data.cache_layout import draws, in_agent_frame, neighbors_name
@@ -18,7 +17,6 @@ from model.forecaster import Features
 from model.geometry import rotate as rotate_vectors
 from model.networks.config import AnyNetworkConfig, NetworkConfig
 from model.scene import AgentType
-from model.standardization import state_scale
 
 
 class Batches:
@@ -147,7 +145,7 @@ STOOD_M = 0.5
 LEFT_M = 2.0
 """m; who is farther away than that after 6 s has left."""
 RECORDED_SHARE = 0.4
-"""Of the pairs with variants that are shown as recorded."""
+"""Share of the pairs with variants that a batch shows as recorded."""
 
 
 def _leaving(cache: Cache) -> Bools:
@@ -157,17 +155,10 @@ def _leaving(cache: Cache) -> Bools:
     there after 3 s are about to leave. Who was seen in one frame only does not count: it may be driving.
     """
     rows = slice(None, None, 1 + cache.manifest.key.variants)
-    scale = HISTORY_SCALE if cache.manifest.key.agent_frame else _GROUND_SCALE
-    first = cache.first[rows]
-    before = cache.history[rows, :, :2] * scale[:2]
-    frames = before.shape[1]
-    distance = np.where(np.arange(frames) >= first[:, None], np.hypot(before[..., 0], before[..., 1]), 0.0)
-    end = cache.future[rows, -1]
-    stood = (first < frames - 1) & (distance.max(axis=1) < STOOD_M)
+    before, end = cache.observed_positions()[rows], cache.future[rows, -1]
+    farthest = np.nanmax(np.hypot(before[..., 0], before[..., 1]), axis=1)
+    stood = (cache.first[rows] < before.shape[1] - 1) & (farthest < STOOD_M)
     return np.asarray(stood & (np.hypot(end[:, 0], end[:, 1]) > LEFT_M))
-
-
-_GROUND_SCALE = state_scale(AgentType.VEHICLE, AgentType.VEHICLE)
 
 
 def _packed_patches(cache: Cache, config: AnyNetworkConfig | None) -> dict[str, Tensor]:
@@ -188,6 +179,7 @@ class JoinedPairs:
     def __init__(self, sources: Sequence[Batches]) -> None:
         self._sources = tuple(sources)
         self._starts = np.cumsum([0, *(len(one) for one in sources)]).tolist()
+        self._leaving = torch.cat([one.leaving for one in sources])
 
     def __len__(self) -> int:
         """Return P, over all sources."""
@@ -201,7 +193,7 @@ class JoinedPairs:
     @property
     def leaving(self) -> Tensor:
         """[P], as of ``Batches``."""
-        return torch.cat([one.leaving for one in self._sources])
+        return self._leaving
 
     @property
     def paths(self) -> Tensor:

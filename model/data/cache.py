@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from model.agent_features import agent_frame_features
+from model.agent_features import HISTORY_SCALE, agent_frame_features
 from model.arrays import Bytes, Float32s, Floats, Ints
 from model.data.cache_layout import (
     FORMAT_VERSION,
@@ -42,11 +42,15 @@ from model.inputs import network_features
 from model.networks.config import AnyNetworkConfig, Frame, NetworkConfig
 from model.raster import FAR, NEAR, cut_patches
 from model.scene import AgentType, Raster
+from model.standardization import state_scale
 
 __all__ = ["Cache", "CacheKey", "build_cache"]
 
 Array: TypeAlias = NDArray[Any]
 Arrays: TypeAlias = dict[str, Array]
+
+
+_GROUND_SCALE = state_scale(AgentType.VEHICLE, AgentType.VEHICLE)
 
 
 @dataclass(frozen=True)
@@ -105,6 +109,14 @@ class Cache:
     def __len__(self) -> int:
         """P."""
         return self.manifest.pairs
+
+    def observed_positions(self) -> Floats:
+        """Return where agents were: [P, F, 2], m, relative to now, in the frame of the histories; NaN where
+        they were not observed."""
+        scale = HISTORY_SCALE if self.manifest.key.agent_frame else _GROUND_SCALE
+        positions = np.array(self.history[..., :2]) * scale[:2]
+        seen = np.arange(positions.shape[1]) >= self.first[:, None]
+        return np.where(seen[..., None], positions, np.nan)
 
     def raster(self, scene: int) -> Raster:
         """The raster of a scene, as the reader gave it.

@@ -33,7 +33,7 @@ def hold(future: Tensor, leaving: Tensor, share: float, generator: torch.Generat
         generator: draws them, on the CPU.
     """
     held = leaving & (torch.rand(len(leaving), generator=generator) >= share)
-    return torch.where(held.to(future.device)[:, None, None], torch.zeros_like(future), future)
+    return future.masked_fill(held.to(future.device)[:, None, None], 0.0)
 
 
 def block(features: Features, future: Tensor) -> Features:

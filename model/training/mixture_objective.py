@@ -24,7 +24,7 @@ from model.training.objectives import Loss
 
 _LEFT = 0.2
 """A neighbour that the truth goes through more nearly than that did not stay where it was."""
-STANDING_MPS = 0.5
+_STANDING_MPS = 0.5
 """A neighbour that is slower stands."""
 
 
@@ -52,9 +52,9 @@ class MixtureWeights(BaseModel):
     expected: float = Field(default=1.0, ge=0)
     """1/m, of the mean distance expected under p(z | x)."""
     off_road: float = Field(default=0.0, ge=0)
-    """Of the probability of the modes that leave the road at any step."""
+    """Weight of leaving the road at any step: of the probability of the modes that do."""
     collision: float = Field(default=0.0, ge=0)
-    """Of the probability of the modes that drive through a neighbour that stands."""
+    """Weight of driving through a neighbour that stands: of the probability of the modes that do."""
     proposal: float = Field(default=0.5, ge=0)
     """Of the distances of the proposals, beside those of the refined modes."""
     blind: float = Field(default=1.0, ge=0)
@@ -162,7 +162,7 @@ def _meets_standing(path: Path, future: Tensor, neighbors: Tensor) -> Tensor:
     truth = Path(x, y, torch.atan2(moved_y, moved_x), torch.zeros_like(x))
     left = drives_through(truth, neighbors) > _LEFT
     speed = NEIGHBOR_VELOCITY_SCALE * neighbors[..., 4:6].norm(dim=-1)
-    stands = (neighbors[..., -1] > 0) & (speed < STANDING_MPS) & ~left[:, 0]
+    stands = (neighbors[..., -1] > 0) & (speed < _STANDING_MPS) & ~left[:, 0]
     met: Tensor = (drives_through(path, neighbors) * stands[:, None]).amax(dim=-1)
     return met
 

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from model.agent_features import HISTORY_SCALE
 from model.arrays import Bools, Floats
 from model.data.batches import Batches
 from model.data.cache import Cache
@@ -19,7 +18,6 @@ from model.mixture import TrajectoryMixture
 from model.network_forecaster import Networks
 from model.networks.config import AnyNetworkConfig
 from model.scene import AgentType, Raster
-from model.standardization import state_scale
 
 BATCH = 512
 
@@ -65,7 +63,7 @@ class Validation:
     def __init__(self, cache: Cache, config: AnyNetworkConfig | None, device: torch.device) -> None:
         self._cache = cache
         self._batches = Batches(cache, device, config)
-        self._stood = _stood(cache)
+        self._stood = stood(cache.observed_positions())
 
     def __call__(self, networks: Networks[Any]) -> dict[str, float]:
         """The figures that need no samples, quick enough for after each epoch."""
@@ -118,12 +116,3 @@ class Validation:
                 self._stood[indices.numpy()],
                 indices.tolist(),
             )
-
-
-def _stood(cache: Cache) -> Bools:
-    """Return which pairs' agents stood before now: [P]."""
-    own_frame = cache.manifest.key.agent_frame
-    scale = (HISTORY_SCALE if own_frame else state_scale(AgentType.VEHICLE, AgentType.VEHICLE))[:2]
-    history = np.array(cache.history[..., :2]) * scale  # Relative to now, however it is turned
-    seen = np.arange(history.shape[1]) >= cache.first[:, None]
-    return stood(np.where(seen[..., None], history, np.nan))
