@@ -113,7 +113,8 @@ class TrainingConfig(BaseModel):
     """Put somebody who stands beyond where some agents went (``model.data.holdups``); in the agent's frame,
     with neighbours."""
     jitter: bool = False
-    """Move histories and maps a little each time (``model.data.jittering``); in the agent's frame only."""
+    """Move histories and maps a little each time, and show scenes in other sizes (``model.data.jittering``);
+    in the agent's frame only."""
     weight_decay: float = Field(default=0.0, ge=0)
     """Decoupled from the gradient (AdamW, Loshchilov and Hutter 2019), per unit of learning rate."""
     mixture: MixtureWeights = MixtureWeights()

@@ -172,7 +172,7 @@ class AgentFrameLearner(DescentLearner):
         for name in features.keys() & {"map", "far_map"}:
             features[name] = unpack_patches(features[name])
         if self._jitter:
-            features = jitter(features)
+            features, future = jitter(features, future)
         loss = mixture_objective(self.network, features, future, self._weights, self._contrast)
         self.descend(loss.value, rate)
         return logged(loss)
