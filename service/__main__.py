@@ -1,5 +1,5 @@
 """``python -m service``: the same as ``cab-forecast``."""
 
-from service.cli.main import app
+from cli.main import app
 
 app()

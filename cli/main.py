@@ -5,7 +5,13 @@ from typing import Annotated
 
 import typer
 
-from service.cli import benchmark, consistency, convert, evaluate, predict, serve, train
+from cli import benchmark
+from cli import consistency
+from cli import convert
+from cli import evaluate
+from cli import predict
+from cli import serve
+from cli import train
 
 app = typer.Typer(
     name="cab-forecast",

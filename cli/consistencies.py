@@ -10,8 +10,8 @@ from cab.forecast.v1.consistency_service_pb2 import (
     ResetSceneResponse,
 )
 from cab_forecast.show_consistency import print_event, print_instants, print_models, print_scene
-from service.cli.asking import Server, asking
-from service.cli.messages import to_json
+from cli.asking import Server, asking
+from cli.messages import to_json
 
 # All of them end with code 1 and one line on standard error when there is no answer.
 

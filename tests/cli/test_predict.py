@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from cab.forecast.v1.prediction_service_pb2 import CONTEXT_BLIND, PredictResponse
 from cab_forecast import demo_request
-from service.cli.main import app
+from cli.main import app
 from tests.cab_forecast.answers import answer
 from tests.cab_forecast.fakes import Failure, Script, free_port, grpc_fake
 

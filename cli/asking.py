@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from cab_forecast.client import Client
 from cab_forecast.errors import UNREACHABLE, ForecastError, Unauthenticated
-from service.cli.failures import fail
+from cli.failures import fail
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ from benchmark.tables import left_out, markdown, tables
 from cab.forecast.v1.model_service_pb2 import Model
 from cab_forecast import AsyncClient
 from model.arrays import Floats
-from service.cli.tables import show_tables
+from cli.tables import show_tables
 
 TABLES_FILE = "tables.md"
 DRAWN = ("cab", "trajectron")

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 from cab.forecast.v1 import consistency_service_pb2 as pb
 from service import errors
-from service.cli.main import app
+from cli.main import app
 from service.server import Server
 from tests.cab_forecast.fakes import free_port
 from tests.service.planes import AGENT, EVENT, MODELS, RESET, SCENE, FakePlane, with_fake_plane
@@ -86,7 +86,7 @@ def test_watch(plane: FakePlane, server: Server) -> None:
     """In a process of its own, ended by Ctrl-C."""
     # Whoever runs the tests in the background has Ctrl-C ignored, and so would this
     heed = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
-    program = f"{heed}; from service.cli.main import app; app()"
+    program = f"{heed}; from cli.main import app; app()"
     command = [sys.executable, "-c", program, "consistency", "watch", "s"]
     for options, expected in (([], "C(1 m) 2.5"), (["--json"], '"missed"')):
         with subprocess.Popen(  # noqa: S603

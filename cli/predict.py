@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from cab_forecast.endpoints import DEFAULT_ENDPOINT
-from service.cli.options import DEFAULT_TIMEOUT, AsJson, Endpoint, Timeout, Token
+from cli.options import DEFAULT_TIMEOUT, AsJson, Endpoint, Timeout, Token
 
 _MOST = 2**32 - 1
 
@@ -56,8 +56,8 @@ def predict(
 ) -> None:
     """Send one request and show its forecasts; options given here replace those in the request."""
     # Imported here, as in all commands: --help must not wait for it.
-    from service.cli.asking import Server  # noqa: PLC0415
-    from service.cli.prediction import Changes, Outputs, run  # noqa: PLC0415
+    from cli.asking import Server  # noqa: PLC0415
+    from cli.prediction import Changes, Outputs, run  # noqa: PLC0415
 
     changes = Changes(
         model=model,

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from model.checkpoint import load_checkpoint
 from model.data.sources import READERS
 from model.training.config import Method
-from service.cli.main import app
+from cli.main import app
 from tests.model.data.records import FixedReader, record
 from tests.model.training.fakes import small_config
 

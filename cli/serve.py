@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from service.cli.failures import fail
+from cli.failures import fail
 
 if TYPE_CHECKING:
     from service.server import Server

@@ -8,9 +8,9 @@ import typer
 from cab.forecast.v1.prediction_service_pb2 import CONTEXT_BLIND, PredictRequest, PredictResponse
 from cab_forecast.demo import demo_request
 from cab_forecast.show import print_forecasts
-from service.cli.asking import Server, asking
-from service.cli.failures import fail
-from service.cli.messages import read_message, to_json, write_message
+from cli.asking import Server, asking
+from cli.failures import fail
+from cli.messages import read_message, to_json, write_message
 
 DEMO = "demo"
 """Stands for the made-up crossing where a file is expected."""

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.failures import fail
+from cli.failures import fail
 
 
 def register(app: typer.Typer) -> None:
@@ -45,8 +45,8 @@ def evaluate(
     from model.evaluation.run import Evaluation, write_results  # noqa: PLC0415
     from model.evaluation.subjects import EvaluationError, choose  # noqa: PLC0415
     from model.evaluation.tables import tables  # noqa: PLC0415
-    from service.cli.evaluation import show_evaluation  # noqa: PLC0415
-    from service.cli.tables import show_tables  # noqa: PLC0415
+    from cli.evaluation import show_evaluation  # noqa: PLC0415
+    from cli.tables import show_tables  # noqa: PLC0415
     from service.settings import bundled_models  # noqa: PLC0415
 
     names = [name.strip() for name in (only or "").split(",") if name.strip()]

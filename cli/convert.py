@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.failures import fail
+from cli.failures import fail
 
 
 class Source(StrEnum):

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from benchmark.archive import FILE
 from benchmark.rules import RULES_FILE
 from model.data.sources import READERS, parse_data
-from service.cli.main import app
+from cli.main import app
 from service.server import Server
 from tests.benchmark.scenes import PAIRS, READER, RECORDS, write_nuscenes_pred
 from tests.model.evaluation.builders import checkpoints

@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from model.data.sources import READERS
-from service.cli.main import app
+from cli.main import app
 from tests.model.data.records import FixedReader, record
 from tests.model.evaluation.builders import PAPER_VERSION, checkpoints, save
 

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from cab_forecast.endpoints import DEFAULT_ENDPOINT
-from service.cli.options import DEFAULT_TIMEOUT, AsJson, Endpoint, Timeout, Token
+from cli.options import DEFAULT_TIMEOUT, AsJson, Endpoint, Timeout, Token
 
 Scene = Annotated[str, typer.Argument(metavar="SCENE", help="The scene_id of the requests.")]
 
@@ -29,8 +29,8 @@ def models(
     as_json: AsJson = False,
 ) -> None:
     """Show what was settled of each model since the server started."""
-    from service.cli.asking import Server
-    from service.cli.consistencies import show_models
+    from cli.asking import Server
+    from cli.consistencies import show_models
 
     show_models(Server(endpoint, token, timeout), as_json)
 
@@ -44,8 +44,8 @@ def scene(
     as_json: AsJson = False,
 ) -> None:
     """Show the newest observation of every agent of a scene, and sums by model."""
-    from service.cli.asking import Server
-    from service.cli.consistencies import show_scene
+    from cli.asking import Server
+    from cli.consistencies import show_scene
 
     show_scene(Server(endpoint, token, timeout), scene_id, as_json)
 
@@ -63,8 +63,8 @@ def agent(
     as_json: AsJson = False,
 ) -> None:
     """Show an agent's last observations, and what was forecast for them."""
-    from service.cli.asking import Server
-    from service.cli.consistencies import show_agent
+    from cli.asking import Server
+    from cli.consistencies import show_agent
 
     show_agent(Server(endpoint, token, timeout), scene_id, agent_id, window, as_json)
 
@@ -78,8 +78,8 @@ def watch(
     as_json: AsJson = False,
 ) -> None:
     """Print what is found out about a scene as it comes, until Ctrl-C or the server's end."""
-    from service.cli.asking import Server
-    from service.cli.consistencies import show_events
+    from cli.asking import Server
+    from cli.consistencies import show_events
 
     show_events(Server(endpoint, token, timeout), scene_id, as_json)
 
@@ -93,7 +93,7 @@ def reset(
     as_json: AsJson = False,
 ) -> None:
     """Make the server forget a scene."""
-    from service.cli.asking import Server
-    from service.cli.consistencies import reset_scene
+    from cli.asking import Server
+    from cli.consistencies import reset_scene
 
     reset_scene(Server(endpoint, token, timeout), scene_id, as_json)

@@ -5,7 +5,7 @@ import sys
 
 from typer.testing import CliRunner
 
-from service.cli.main import app
+from cli.main import app
 
 
 def test_version() -> None:
@@ -17,7 +17,7 @@ def test_version() -> None:
 def test_help_names_the_commands_and_loads_nothing_heavy() -> None:
     code = (
         "import sys\n"
-        "from service.cli.main import app\n"
+        "from cli.main import app\n"
         "try: app(['--help'])\n"
         "except SystemExit: pass\n"
         "print('LOADED', *{m.partition('.')[0] for m in sys.modules})"

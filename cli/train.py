@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.failures import fail
+from cli.failures import fail
 
 
 def register(app: typer.Typer) -> None:
@@ -57,7 +57,7 @@ def register(app: typer.Typer) -> None:
         from model.forecaster import Protocol  # noqa: PLC0415
         from model.training.config import TrainingError, load_config, parse_method  # noqa: PLC0415
         from model.training.run import Run, Source  # noqa: PLC0415
-        from service.cli.training import show_training  # noqa: PLC0415
+        from cli.training import show_training  # noqa: PLC0415
 
         changes: dict[str, object] = {"epochs": epochs, "learning_rate": learning_rate, "seed": seed}
         changes["cooldown_epochs"] = cooldown_epochs

@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from cab_forecast.endpoints import DEFAULT_ENDPOINT
-from service.cli.failures import fail
-from service.cli.options import Endpoint, Token
+from cli.failures import fail
+from cli.options import Endpoint, Token
 
 _SAMPLES = 2000
 
@@ -76,7 +76,7 @@ def benchmark(
     from model.data.scenes import DataError  # noqa: PLC0415
     from model.data.sources import READERS, parse_data, parse_protocol  # noqa: PLC0415
     from model.metrics.density import DRAWS  # noqa: PLC0415
-    from service.cli.benchmarking import Asking, show_benchmark  # noqa: PLC0415
+    from cli.benchmarking import Asking, show_benchmark  # noqa: PLC0415
 
     names = [name.strip() for name in (models or "").split(",") if name.strip()]
     if models is not None and not names:

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 import model.convert
 from model.checkpoint import CheckpointError
 from model.convert import UnsafePickleError
-from service.cli.main import app
+from cli.main import app
 
 
 def run(*arguments: str) -> tuple[int, str, str]:
