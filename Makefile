@@ -46,7 +46,7 @@ format: install
 	$(BIN)/ruff format .
 
 bench: install  ## speed of the forward against this process's own matmul rate; start and memory of the server; cost of tracking
-	$(BIN)/python -m model.bench
+	$(BIN)/python -m loadtest.forward
 	$(BIN)/python -m loadtest.startup
 	$(BIN)/python -m loadtest.tracking
 

@@ -68,7 +68,7 @@ def serving(models: Path, **settings: object) -> Iterator[Server]:
 
 def random_checkpoint(folder: Path) -> None:
     """A CAB checkpoint of the full size."""
-    from model.bench import cab_network  # noqa: PLC0415 (torch is slow to import)
+    from loadtest.forward import cab_network  # noqa: PLC0415 (torch is slow to import)
     from model.checkpoint import save_checkpoint  # noqa: PLC0415
 
     model = cab_network()

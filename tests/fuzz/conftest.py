@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from model import kalman, physics
-from model.bench import cab_network
+from loadtest.forward import cab_network
 from model.registry import Registry
 from service.server import Server
 from tests.service.servers import settings

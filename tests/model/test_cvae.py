@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from model.arrays import Ints
-from model.bench import cab_network
+from loadtest.forward import cab_network
 from model.cvae import CvaeForecaster, CvaeNetworks
 from model.forecaster import Context, ModelInfo, join
 from model.networks.config import BlindContext, NetworkConfig

@@ -2,7 +2,7 @@
 
 import torch
 
-from model.bench import features_in_agent_frame
+from loadtest.forward import features_in_agent_frame
 from model.data import hiding
 from model.data.packing import UNKNOWN, unpack_patches
 from model.forecaster import Features

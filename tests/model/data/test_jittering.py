@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from model.bench import features_in_agent_frame
+from loadtest.forward import features_in_agent_frame
 from model.data import jittering
 from model.data.jittering import MAX_SHIFT_M, MAX_STRETCH, jitter, moved, stretched
 from model.networks.agent_frame import read_patch

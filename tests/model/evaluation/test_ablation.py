@@ -1,6 +1,6 @@
 import torch
 
-from model.bench import features
+from loadtest.forward import features
 from model.cvae import CvaeForecaster
 from model.evaluation.ablation import Without, ablations, without_both, without_map, without_neighbors
 from model.forecaster import Context, Features

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from model.agent_features import agent_frame_features
-from model.bench import cab_network, features_in_agent_frame
+from loadtest.forward import cab_network, features_in_agent_frame
 from model.checkpoint import load_checkpoint, save_checkpoint
 from model.cvae import CvaeForecaster, CvaeNetworks
 from model.forecaster import Context, Features

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from model.bench import features
+from loadtest.forward import features
 from model.forecaster import Features
 from model.networks.config import AnyNetworkConfig, BlindContext, CoverNetConfig, NetworkConfig
 from model.networks.covernet import present_heading, turned
