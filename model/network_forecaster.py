@@ -14,7 +14,7 @@ from model.inputs import network_features
 from model.mixture import TrajectoryMixture
 from model.networks.config import AnyNetworkConfig, NetworkConfig
 from model.scene import AgentType, Scene
-from model.single import require_observed
+from model.baselines.unimodal import require_observed
 
 SMALLEST_VARIANCE = 1e-6
 """m²; no forecast is surer than that in any direction."""

@@ -130,7 +130,8 @@ def _is_causal(info: ModelInfo) -> bool:
 
 def _baselines() -> Iterator[Forecaster]:
     """What needs no checkpoint. A new baseline is a line here."""
-    from model import kalman, physics  # noqa: PLC0415 (see above)
+    from model.baselines import kalman
+    from model.baselines import physics
 
     yield from physics.baselines()
     yield kalman.Kalman()

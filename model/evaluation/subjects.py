@@ -4,7 +4,8 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from model import kalman, physics
+from model.baselines import kalman
+from model.baselines import physics
 from model.checkpoint import Checkpoint
 from model.forecaster import Forecaster, ModelInfo, Protocol
 from model.metrics.oracle import ORACLE

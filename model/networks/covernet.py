@@ -11,7 +11,7 @@ from model.networks.dynamics import Positions
 from model.networks.encoders import ConvShape, MapEncoder
 from model.scene import AgentType
 from model.standardization import HEADING, state_scale
-from model.uncertainty import oriented_covariance
+from model.baselines.uncertainty import oriented_covariance
 
 _MAP_CHANNELS = 3
 _PIXELS = 64 * 4 * 4

@@ -9,7 +9,7 @@ import pytest
 from cab_forecast import Status
 from cab_forecast.layers import decode_layers
 from model.arrays import Floats
-from model.physics import baselines
+from model.baselines.physics import baselines
 from tests.cases import checks, roads, scenes
 from tests.cases.bands import readings
 from tests.cases.case import Frame, Pose, Row

@@ -6,7 +6,7 @@ import pytest
 
 from model.checkpoint import CheckpointError, save_checkpoint
 from model.forecaster import Forecaster, ModelInfo, Protocol
-from model.kalman import Kalman
+from model.baselines.kalman import Kalman
 from model.registry import DuplicateModelError, Registry, UnknownModelError
 from tests.model.checkpoints import info, network, tensors
 

@@ -4,7 +4,7 @@ import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from model import kalman
+from model.baselines import kalman
 from model.forecaster import ModelInfo, Protocol
 from service.server import Server
 from service.telemetry.metrics import Metrics

@@ -8,9 +8,9 @@ from torch import Tensor
 from model.arrays import Floats
 from model.forecaster import Context, Protocol, agent_count, join
 from model.mixture import TrajectoryMixture
-from model.physics import Physics, baselines
+from model.baselines.physics import Physics, baselines
 from model.scene import AgentStates, AgentType, Scene
-from model.uncertainty import Growth, Spread, SpreadBySpeed, aligned_covariance, ellipse_radius
+from model.baselines.uncertainty import Growth, Spread, SpreadBySpeed, aligned_covariance, ellipse_radius
 from tests.model.scenes import present
 
 TIMES = 0.5 * np.arange(1, 13)

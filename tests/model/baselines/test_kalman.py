@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from model.arrays import Floats
 from model.forecaster import join
-from model.kalman import HISTORY_FRAMES, NOISE, Kalman, Noise
+from model.baselines.kalman import HISTORY_FRAMES, NOISE, Kalman, Noise
 from model.scene import AgentType
 from tests.model.scenes import present, tracks
 
