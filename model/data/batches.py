@@ -11,7 +11,7 @@ from model.data.cache import Cache
 from model.data.cache_layout import draws, in_agent_frame, neighbors_name
 from model.data.packing import unpack_patches
 from model.data.patches import PatchCutter
-from model.data.rotation import rotate
+from model.data.augmentation import rotate
 from model.data.scenes import DataError
 from model.forecaster import Features
 from model.geometry import rotate as rotate_vectors

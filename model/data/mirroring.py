@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from model.data.rotation import NEIGHBORS
+from model.data.augmentation import NEIGHBORS
 from model.forecaster import Features
 from model.standardization import HEADING
 

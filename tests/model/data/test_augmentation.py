@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model.data.protocols import frame_scene
-from model.data.rotation import rotate
+from model.data.augmentation import rotate
 from model.data.scenes import SceneRecord
 from model.features import scene_features
 from model.forecaster import Context, Features, Protocol
