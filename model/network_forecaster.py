@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from model.arrays import Ints
 from model.forecaster import Context, Features, Forecaster, ModelInfo
-from model.inputs import network_features
+from model.features.inputs import network_features
 from model.mixture import TrajectoryMixture
 from model.networks.config import AnyNetworkConfig, NetworkConfig
 from model.scene import AgentType, Scene

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from model.forecaster import Features
-from model.standardization import HEADING
+from model.features.standardization import HEADING
 
 NEIGHBORS = "neighbors."
 """Features whose names begin so are states of neighbours."""

@@ -1,4 +1,4 @@
-"""Batches of a cache's pairs on a device, as ``model.inputs`` would make them."""
+"""Batches of a cache's pairs on a device, as ``model.features.inputs`` would make them."""
 
 from collections.abc import Sequence
 
@@ -125,7 +125,7 @@ class Batches:
             indices: [n] int64, on any device.
 
         Returns:
-            The features of ``model.inputs.network_features`` with full context, patches included, and the
+            The features of ``model.features.inputs.network_features`` with full context, patches included, and the
             future [n, 12, 2] float32, m, relative to the position now, ground frame; on the device.
         """
         indices = indices.to(self._device)

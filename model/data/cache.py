@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from model.agent_features import HISTORY_SCALE, agent_frame_features
+from model.features.agent_features import HISTORY_SCALE, agent_frame_features
 from model.arrays import Bytes, Float32s, Floats, Ints
 from model.data.cache_layout import (
     FORMAT_VERSION,
@@ -38,11 +38,11 @@ from model.data.scenes import DataError, Reader, SceneRecord
 from model.data.sensing import SensedFrames
 from model.forecaster import Context, Protocol
 from model.geometry import wrap_angle
-from model.inputs import network_features
+from model.features.inputs import network_features
 from model.networks.config import AnyNetworkConfig, Frame, NetworkConfig
 from model.raster import FAR, NEAR, cut_patches
 from model.scene import AgentType, Raster
-from model.standardization import state_scale
+from model.features.standardization import state_scale
 
 __all__ = ["Cache", "CacheKey", "build_cache"]
 
@@ -59,7 +59,7 @@ class Cache:
 
     manifest: Manifest
     history: Float32s
-    """[P, F, 8], standardised own states (``model.features``)."""
+    """[P, F, 8], standardised own states (``model.features.scene_features``)."""
     first: Ints
     """[P], the first observed frame of the history."""
     velocity: Float32s
@@ -96,11 +96,11 @@ class Cache:
     raster_pixels_per_meter: Floats
     """[S]."""
     surroundings: Float32s | None = None
-    """[P, B, 5], neighbours as boxes (``model.surroundings``); None: not held."""
+    """[P, B, 5], neighbours as boxes (``model.features.neighbor_boxes``); None: not held."""
     speed: Float32s | None = None
     """[P], m/s along the heading now; this and what follows is held in the agents' frame only."""
     agents: Float32s | None = None
-    """[P, M, 11], neighbours one by one (``model.agent_features``)."""
+    """[P, M, 11], neighbours one by one (``model.features.agent_features``)."""
     near_patch: Bytes | None = None
     """[P, 100, 100], map patches of three layers a byte (``model.data.packing``)."""
     far_patch: Bytes | None = None

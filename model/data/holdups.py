@@ -9,7 +9,7 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from model.agent_features import NEIGHBOR_POSITION_SCALE, NEIGHBOR_REACH_M
+from model.features.agent_features import NEIGHBOR_POSITION_SCALE, NEIGHBOR_REACH_M
 from model.forecaster import Features
 
 BLOCKED: Final = 0.12

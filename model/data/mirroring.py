@@ -5,7 +5,7 @@ from torch import Tensor
 
 from model.data.augmentation import NEIGHBORS
 from model.forecaster import Features
-from model.standardization import HEADING
+from model.features.standardization import HEADING
 
 _SIDEWAYS = (1, 3, 5, HEADING, HEADING + 1)
 """Of a state: y, its velocity and acceleration; of a vehicle also heading and heading rate."""

@@ -19,7 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from model.agent_features import (
+from model.features.agent_features import (
     NEIGHBOR_FEATURES,
     NEIGHBOR_POSITION_SCALE,
     NEIGHBOR_VELOCITY_SCALE,
@@ -30,7 +30,7 @@ from model.networks.dynamics import Positions
 from model.networks.recurrent import HistoryLSTM
 from model.raster import FAR, PatchGeometry
 from model.scene import STEP_SECONDS, AgentType
-from model.standardization import STATE_SIZE
+from model.features.standardization import STATE_SIZE
 
 STEPS = 12
 """T, steps of 0.5 s that are decoded."""

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, NonNegativeFloat, Tag, model_validator
 
 from model.scene import AgentType
-from model.standardization import STATE_SIZE
+from model.features.standardization import STATE_SIZE
 
 HIDDEN = 32
 """Width of every encoder (Trajectron++, appendix)."""

@@ -10,7 +10,7 @@ from model.networks.drawing import draw_boxes
 from model.networks.dynamics import Positions
 from model.networks.encoders import ConvShape, MapEncoder
 from model.scene import AgentType
-from model.standardization import HEADING, state_scale
+from model.features.standardization import HEADING, state_scale
 from model.baselines.uncertainty import oriented_covariance
 
 _MAP_CHANNELS = 3

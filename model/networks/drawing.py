@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from model.raster import COLUMNS_RIGHT, PATCH_PIXELS_PER_METER, PATCH_SIZE, ROWS_BEHIND
-from model.surroundings import BOX_REACH
+from model.features.neighbor_boxes import BOX_REACH
 
 _RADIUS = math.floor(BOX_REACH * PATCH_PIXELS_PER_METER + math.sqrt(0.5))
 """Pixels from the one that a box's middle lies in: none farther away than that, or one more upwards, is
@@ -20,7 +20,7 @@ def draw_boxes(boxes: Tensor) -> Tensor:
     over one pixel, so that a box moves smoothly. Only the pixels around each box are looked at.
 
     Args:
-        boxes: [N, S, 5], as ``model.surroundings`` makes them; what has no length is not drawn.
+        boxes: [N, S, 5], as ``model.features.neighbor_boxes`` makes them; what has no length is not drawn.
 
     Returns:
         [N, 100, 100] float32 from −1 (free) to 1 (covered).

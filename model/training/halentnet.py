@@ -14,7 +14,7 @@ from torch import Tensor
 from model.forecaster import Context
 from model.networks.covernet import present_heading, turned
 from model.scene import AgentType
-from model.standardization import FUTURE_POSITION_SCALE
+from model.features.standardization import FUTURE_POSITION_SCALE
 from model.training.config import TrainingConfig
 from model.training.discriminator import Discriminator, Verdict
 from model.training.learner import Batch, CvaeLearner

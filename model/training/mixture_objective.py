@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
-from model.agent_features import NEIGHBOR_VELOCITY_SCALE
+from model.features.agent_features import NEIGHBOR_VELOCITY_SCALE
 from model.forecaster import Context, Features
 from model.networks.agent_frame import AgentFrameNetwork, Modes, Path, drives_through, read_patch
 from model.raster import FAR

@@ -11,7 +11,7 @@ from cab.forecast.v1.prediction_service_pb2 import PredictRequest
 from cab_forecast.layers import decode_layers
 from model.arrays import Floats
 from model.data.protocols import SceneFrames
-from model.features import scene_features
+from model.features.scene_features import scene_features
 from model.forecaster import Context, Protocol
 from model.networks.config import NetworkConfig
 from model.resample import resample

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from model.agent_features import agent_frame_features
+from model.features.agent_features import agent_frame_features
 from model.data.batches import Batches, JoinedPairs
 from model.data.cache import Cache, build_cache
 from model.data.caches import open_cache

@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 from model.data.protocols import frame_scene
 from model.data.augmentation import rotate
 from model.data.scenes import SceneRecord
-from model.features import scene_features
+from model.features.scene_features import scene_features
 from model.forecaster import Context, Features, Protocol
 from model.networks.config import NetworkConfig
 from model.scene import AgentType
-from model.standardization import HEADING
+from model.features.standardization import HEADING
 from tests.model.data.records import record, turned
 
 CONFIG = NetworkConfig()

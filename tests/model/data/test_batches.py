@@ -12,7 +12,7 @@ from model.data.batches import Batches
 from model.data.cache import Cache, build_cache
 from model.data.protocols import frame_scene
 from model.data.scenes import DataError, SceneRecord
-from model.features import scene_features
+from model.features.scene_features import scene_features
 from model.forecaster import Context, Protocol, join
 from model.networks.config import CoverNetConfig, NetworkConfig
 from model.networks.covernet import present_heading

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from model.agent_features import NEIGHBOR_POSITION_SCALE, NEIGHBOR_REACH_M, NEIGHBORS
+from model.features.agent_features import NEIGHBOR_POSITION_SCALE, NEIGHBOR_REACH_M, NEIGHBORS
 from loadtest.forward import features_in_agent_frame
 from model.data.holdups import ASIDE_M, BLOCKED, GAP_M, block, hold
 from model.forecaster import Features

@@ -5,17 +5,17 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from model.agent_features import agent_frame_features
+from model.features.agent_features import agent_frame_features
 from model.data.mirroring import mirror
 from model.data.protocols import frame_scene
 from model.data.scenes import SceneRecord, Track
-from model.features import scene_features
+from model.features.scene_features import scene_features
 from model.forecaster import Context, Features, Protocol
 from model.networks.config import Frame, NetworkConfig
 from model.networks.drawing import draw_boxes
 from model.scene import AgentType, Raster
-from model.standardization import HEADING
-from model.surroundings import surroundings
+from model.features.standardization import HEADING
+from model.features.neighbor_boxes import surroundings
 from tests.model.data.records import record
 
 CONFIG = NetworkConfig()

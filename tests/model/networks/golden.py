@@ -7,7 +7,7 @@ import torch
 
 from model.forecaster import Features
 from model.scene import AgentType
-from model.standardization import state_scale
+from model.features.standardization import state_scale
 
 TYPES = (AgentType.VEHICLE, AgentType.PEDESTRIAN)
 

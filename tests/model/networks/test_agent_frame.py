@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from model.agent_features import agent_frame_features
+from model.features.agent_features import agent_frame_features
 from loadtest.forward import cab_network, features_in_agent_frame
 from model.checkpoint import load_checkpoint, save_checkpoint
 from model.cvae import CvaeForecaster, CvaeNetworks

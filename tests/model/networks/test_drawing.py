@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from model.networks.drawing import draw_boxes
-from model.surroundings import BOX_SIZE, BOXES
+from model.features.neighbor_boxes import BOX_SIZE, BOXES
 
 SIZES = list(BOX_SIZE.values())
 

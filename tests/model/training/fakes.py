@@ -7,7 +7,7 @@ from loadtest.forward import features
 from model.forecaster import Features
 from model.networks.config import AnyNetworkConfig, BlindContext, CoverNetConfig, NetworkConfig
 from model.networks.covernet import present_heading, turned
-from model.surroundings import BOX_NUMBERS, BOXES
+from model.features.neighbor_boxes import BOX_NUMBERS, BOXES
 from model.training.config import Method, TrainingConfig
 
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from model.agent_features import NEIGHBOR_POSITION_SCALE, NEIGHBOR_VELOCITY_SCALE
+from model.features.agent_features import NEIGHBOR_POSITION_SCALE, NEIGHBOR_VELOCITY_SCALE
 from loadtest.forward import features_in_agent_frame
 from model.forecaster import Context, Features
 from model.networks.agent_frame import STEPS, AgentFrameNetwork

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from model.agent_features import HISTORY_SCALE, NEIGHBORS, agent_frame_features
+from model.features.agent_features import HISTORY_SCALE, NEIGHBORS, agent_frame_features
 from model.arrays import Bytes, Float32s, Ints
 from model.forecaster import Context
 from model.geometry import rotate

@@ -6,11 +6,11 @@ import torch
 from model.arrays import Float32s, Floats, Ints
 from model.forecaster import Context, Features
 from model.geometry import wrap_angle
-from model.neighbors import edge_ramps, neighbor_sums
+from model.features.neighbors import edge_ramps, neighbor_sums
 from model.networks.config import NetworkConfig
 from model.raster import PATCH_SIZE, cut_patches
 from model.scene import AgentStates, AgentType, Scene
-from model.standardization import HEADING, state_scale, state_vectors
+from model.features.standardization import HEADING, state_scale, state_vectors
 
 
 def scene_features(

@@ -2,13 +2,13 @@
 
 import torch
 
-from model.agent_features import agent_frame_features
+from model.features.agent_features import agent_frame_features
 from model.arrays import Ints
-from model.features import scene_features
+from model.features.scene_features import scene_features
 from model.forecaster import Context, Features
 from model.networks.config import AnyNetworkConfig, Frame, NetworkConfig
 from model.scene import AgentType, Scene
-from model.surroundings import surroundings
+from model.features.neighbor_boxes import surroundings
 
 
 def network_features(
@@ -17,9 +17,9 @@ def network_features(
     """Features of n agents of one type.
 
     Returns:
-        Those of ``model.features.scene_features``; for a network of the agent's frame those of
-        ``model.agent_features.agent_frame_features``; for CoverNet the former without neighbours' histories,
-        but with ``surroundings`` [n, S, 5] float32 (``model.surroundings``) where it draws any and the
+        Those of ``model.features.scene_features.scene_features``; for a network of the agent's frame those of
+        ``model.features.agent_features.agent_frame_features``; for CoverNet the former without neighbours' histories,
+        but with ``surroundings`` [n, S, 5] float32 (``model.features.neighbor_boxes``) where it draws any and the
         context is full.
     """
     if isinstance(config, NetworkConfig) and config.frame is Frame.AGENT:
