@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from model.features.agent_features import NEIGHBOR_FEATURES, NEIGHBORS
-from model.cvae import CvaeForecaster, CvaeNetworks
+from model.networks.cvae import CvaeForecaster, CvaeNetworks
 from model.forecaster import Context, Features, ModelInfo, Protocol
 from model.networks.config import BlindContext, Frame, NetworkConfig
 from model.scene import AgentType

@@ -17,7 +17,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from model.covernet import CoverNetForecaster
-from model.cvae import CvaeForecaster
+from model.networks.cvae import CvaeForecaster
 from model.forecaster import Forecaster, ModelInfo
 from model.networks.config import AnyNetworkConfig, CoverNetConfig
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from torch import Tensor
 
 from model.forecaster import ModelInfo
-from model.network_forecaster import NetworkForecaster, Networks
+from model.networks.forecaster import NetworkForecaster, Networks
 from model.networks.config import CoverNetConfig
 from model.networks.covernet import CoverNet
 

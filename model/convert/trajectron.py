@@ -11,7 +11,7 @@ from model.checkpoint import save_checkpoint
 from model.convert.errors import ConversionError
 from model.convert.legacy import read_parameters
 from model.convert.names import rename
-from model.cvae import CvaeForecaster
+from model.networks.cvae import CvaeForecaster
 from model.forecaster import ModelInfo, Protocol
 from model.networks.config import BlindContext, NetworkConfig
 from model.scene import AgentType

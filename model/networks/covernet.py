@@ -6,7 +6,7 @@ from torch import Tensor, nn
 
 from model.forecaster import Context, Features
 from model.networks.config import CoverNetConfig
-from model.networks.drawing import draw_boxes
+from model.networks.rasterize_boxes import draw_boxes
 from model.networks.dynamics import Positions
 from model.networks.encoders import ConvShape, MapEncoder
 from model.scene import AgentType

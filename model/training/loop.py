@@ -14,7 +14,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from model.data.holdups import hold
 from model.data.mirroring import mirror
-from model.network_forecaster import Networks
+from model.networks.forecaster import Networks
 from model.training import processes
 from model.training.annealing import ANNEALED, KL_SHARE, Z_LOGIT_CLIP, cooldown, learning_rate
 from model.training.config import TrainingConfig, TrainingError

@@ -15,7 +15,7 @@ from model.metrics.aggregate import MetricMeans
 from model.metrics.evaluate import instance_metrics
 from model.metrics.standing import stood
 from model.mixture import TrajectoryMixture
-from model.network_forecaster import Networks
+from model.networks.forecaster import Networks
 from model.networks.config import AnyNetworkConfig
 from model.scene import AgentType, Raster
 

@@ -6,7 +6,7 @@ import sys
 MODULES = ("run", "judge", "submission", "tables", "compare", "report.page")
 FORBIDDEN = (
     "model.networks",
-    "model.cvae",
+    "model.networks.cvae",
     "model.covernet",
     "model.registry",
     "model.checkpoint",

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from model.cvae import CvaeNetworks
+from model.networks.cvae import CvaeNetworks
 from model.forecaster import ModelInfo, Protocol
 from model.networks.config import AnyNetworkConfig, NetworkConfig
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from model.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
-from model.cvae import CvaeForecaster
+from model.networks.cvae import CvaeForecaster
 from model.forecaster import ModelInfo
 from model.networks.config import NetworkConfig
 from tests.model.checkpoints import info, network, tensors

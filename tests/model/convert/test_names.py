@@ -6,7 +6,7 @@ from safetensors.torch import load_file
 
 from model.convert.errors import ConversionError
 from model.convert.names import rename
-from model.cvae import CvaeNetworks
+from model.networks.cvae import CvaeNetworks
 from model.networks.config import BlindContext, NetworkConfig
 
 ONE = torch.ones(1)

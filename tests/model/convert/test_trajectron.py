@@ -10,7 +10,7 @@ import torch
 
 from model.checkpoint import load_checkpoint
 from model.convert import ConversionError, UnsafePickleError, convert_trajectron
-from model.cvae import CvaeForecaster
+from model.networks.cvae import CvaeForecaster
 from model.forecaster import Context, Protocol
 from model.networks.network import AgentNetwork
 from model.scene import AgentType

@@ -1,7 +1,7 @@
 import torch
 
 from loadtest.forward import features
-from model.cvae import CvaeForecaster
+from model.networks.cvae import CvaeForecaster
 from model.evaluation.ablation import Without, ablations, without_both, without_map, without_neighbors
 from model.forecaster import Context, Features
 from model.networks.config import NetworkConfig

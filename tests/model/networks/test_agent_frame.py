@@ -13,7 +13,7 @@ from torch import Tensor
 from model.features.agent_features import agent_frame_features
 from loadtest.forward import cab_network, features_in_agent_frame
 from model.checkpoint import load_checkpoint, save_checkpoint
-from model.cvae import CvaeForecaster, CvaeNetworks
+from model.networks.cvae import CvaeForecaster, CvaeNetworks
 from model.forecaster import Context, Features
 from model.networks.agent_frame import STEPS, AgentFrameNetwork, Modes, drive, read_patch
 from model.networks.config import BlindContext, Frame, NetworkConfig

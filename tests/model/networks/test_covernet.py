@@ -17,7 +17,7 @@ from model.networks.covernet import CoverNet
 from model.registry import Registry
 from model.scene import AgentType, Scene
 from tests.model.checkpoints import info
-from tests.model.test_cvae import TYPES, VEHICLES, scene
+from tests.model.networks.test_cvae import TYPES, VEHICLES, scene
 
 MEMBERS = 40
 CONFIG = CoverNetConfig(members=MEMBERS)

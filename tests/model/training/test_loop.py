@@ -10,9 +10,9 @@ import torch
 from pydantic import ValidationError
 from torch import Tensor, nn
 
-from model.cvae import CvaeNetworks
+from model.networks.cvae import CvaeNetworks
 from model.forecaster import Context
-from model.network_forecaster import Networks
+from model.networks.forecaster import Networks
 from model.networks.config import NetworkConfig
 from model.networks.covernet import CoverNet
 from model.scene import AgentType

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import load_file
 
-from model.cvae import CvaeNetworks
+from model.networks.cvae import CvaeNetworks
 from model.networks.config import BlindContext, NetworkConfig
 from model.training import processes
 

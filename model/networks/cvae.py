@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from torch import Tensor
 
 from model.forecaster import ModelInfo
-from model.network_forecaster import NetworkForecaster, Networks
+from model.networks.forecaster import NetworkForecaster, Networks
 from model.networks.agent_frame import AgentFrameNetwork
 from model.networks.config import Frame, NetworkConfig
 from model.networks.network import AgentNetwork

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from model.networks.drawing import draw_boxes
+from model.networks.rasterize_boxes import draw_boxes
 from model.features.neighbor_boxes import BOX_SIZE, BOXES
 
 SIZES = list(BOX_SIZE.values())

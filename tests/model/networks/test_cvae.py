@@ -8,7 +8,7 @@ import torch
 
 from model.arrays import Ints
 from loadtest.forward import cab_network
-from model.cvae import CvaeForecaster, CvaeNetworks
+from model.networks.cvae import CvaeForecaster, CvaeNetworks
 from model.forecaster import Context, ModelInfo, join
 from model.networks.config import BlindContext, NetworkConfig
 from model.resample import resample
