@@ -9,7 +9,7 @@ from benchmark.plan import HISTORY_FRAMES, PlannedScene
 from model.arrays import Floats
 from model.metrics.hard import HARD_SHARES, hardest
 from model.mixture import TrajectoryMixture
-from model.scene import Raster
+from model.scenes.scene import Raster
 
 SHOWN = 6
 """Hard cases that a report draws."""

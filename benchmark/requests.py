@@ -8,8 +8,8 @@ from cab_forecast import agent, predict_request, scene_raster
 from model.arrays import Floats
 from model.data.protocols import SceneFrames
 from model.forecaster import Protocol
-from model.observations import Observations
-from model.scene import STEP_SECONDS, Raster
+from model.scenes.observations import Observations
+from model.scenes.scene import STEP_SECONDS, Raster
 
 REACH_M = 74.0
 """m around an agent that are sent of the map; a far patch reaches 71 m, and where recorded rasters end, 75 m

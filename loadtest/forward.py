@@ -17,7 +17,7 @@ from model.features.agent_features import NEIGHBOR_FEATURES, NEIGHBORS
 from model.networks.cvae import CvaeForecaster, CvaeNetworks
 from model.forecaster import Context, Features, ModelInfo, Protocol
 from model.networks.config import BlindContext, Frame, NetworkConfig
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 
 AGENTS = (1, 8, 32, 128)
 FLOP_PER_AGENT = {Frame.GROUND: 42e6, Frame.AGENT: 25e6}

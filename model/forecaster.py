@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict
 
 from model.arrays import Ints
 from model.mixture import TrajectoryMixture
-from model.scene import STEP_SECONDS, AgentType, Scene
+from model.scenes.scene import STEP_SECONDS, AgentType, Scene
 
 Features: TypeAlias = dict[str, torch.Tensor]
 """What a forward needs of each agent, by name; the first axis of every tensor is the agents'."""

@@ -15,7 +15,7 @@ from torch import Tensor
 from model.arrays import Ints
 from model.forecaster import Context, Features, Forecaster, ModelInfo, Protocol
 from model.mixture import TrajectoryMixture
-from model.scene import STEP_SECONDS, AgentType, Scene
+from model.scenes.scene import STEP_SECONDS, AgentType, Scene
 from model.baselines.unimodal import require_observed, single_mode, step_times
 
 HISTORY_FRAMES = 5

@@ -17,7 +17,7 @@ from model.baselines import uncertainty
 from model.arrays import Ints
 from model.forecaster import Context, Features, Forecaster, ModelInfo, Protocol
 from model.mixture import TrajectoryMixture
-from model.scene import AgentType, Scene
+from model.scenes.scene import AgentType, Scene
 from model.baselines.unimodal import require_observed, single_mode, step_times
 from model.baselines.uncertainty import SpreadBySpeed, aligned_covariance
 

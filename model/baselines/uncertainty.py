@@ -49,7 +49,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 
 
 @dataclass(frozen=True)

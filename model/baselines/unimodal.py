@@ -6,7 +6,7 @@ from torch import Tensor
 from model.arrays import Ints
 from model.forecaster import ModelInfo
 from model.mixture import TrajectoryMixture
-from model.scene import STEP_SECONDS, AgentStates
+from model.scenes.scene import STEP_SECONDS, AgentStates
 
 
 def require_observed(states: AgentStates, targets: Ints) -> None:

@@ -14,7 +14,7 @@ from model.convert.names import rename
 from model.networks.cvae import CvaeForecaster
 from model.forecaster import ModelInfo, Protocol
 from model.networks.config import BlindContext, NetworkConfig
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 
 _REQUIRED: Final[dict[str, Any]] = {
     "K": 25,

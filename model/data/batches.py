@@ -16,7 +16,7 @@ from model.data.scenes import DataError
 from model.forecaster import Features
 from model.geometry import rotate as rotate_vectors
 from model.networks.config import AnyNetworkConfig, NetworkConfig
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 
 
 class Batches:

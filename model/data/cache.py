@@ -40,8 +40,8 @@ from model.forecaster import Context, Protocol
 from model.geometry import wrap_angle
 from model.features.inputs import network_features
 from model.networks.config import AnyNetworkConfig, Frame, NetworkConfig
-from model.raster import FAR, NEAR, cut_patches
-from model.scene import AgentType, Raster
+from model.scenes.raster import FAR, NEAR, cut_patches
+from model.scenes.scene import AgentType, Raster
 from model.features.standardization import state_scale
 
 __all__ = ["Cache", "CacheKey", "build_cache"]

@@ -10,8 +10,8 @@ from model.data.checks import FUTURE_STEPS
 from model.data.scenes import Reader
 from model.forecaster import Protocol
 from model.networks.config import AnyNetworkConfig, CoverNetConfig, Frame, NetworkConfig
-from model.raster import PATCH_SIZE
-from model.scene import AgentType
+from model.scenes.raster import PATCH_SIZE
+from model.scenes.scene import AgentType
 from model.features.standardization import STATE_SIZE
 from model.features.neighbor_boxes import BOX_NUMBERS, BOXES
 

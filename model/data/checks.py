@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from model.data.scenes import DataError, Pair, Track
-from model.raster import PATCH_PIXELS_PER_METER
-from model.scene import AgentType, Raster
+from model.scenes.raster import PATCH_PIXELS_PER_METER
+from model.scenes.scene import AgentType, Raster
 
 FUTURE_STEPS = 12
 """Frames of truth behind the present: 6 s."""
@@ -41,7 +41,7 @@ def check_pairs(where: str, tracks: Sequence[Track], pairs: Sequence[Pair]) -> N
 
 
 def check_raster(where: str, raster: Raster) -> None:
-    """The raster is one that patches are cut from as it is: ``model.raster`` first coarsens finer ones.
+    """The raster is one that patches are cut from as it is: ``model.scenes.raster`` first coarsens finer ones.
 
     Args:
         where: the file (or scene) to name.

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from model.forecaster import Features
-from model.raster import FAR, NEAR, PatchGeometry
+from model.scenes.raster import FAR, NEAR, PatchGeometry
 
 HISTORY_NOISE: Final = (0.0015, 0.006, 0.007, 0.02, 0.07, 0.07, 0.02, 0.04)
 """Standard deviations, at most, of a history in its scales: 3 cm, 0.1 m/s, 0.2 to 0.35 m/s², 0.01 rad,

@@ -18,7 +18,7 @@ from model.arrays import Floats
 from model.data.checks import FUTURE_STEPS, check_pairs
 from model.data.nuscenes_map import VectorMap
 from model.data.scenes import DataError, Pair, SceneRecord, Track
-from model.scene import AgentType, Raster
+from model.scenes.scene import AgentType, Raster
 
 EGO = "ego"
 """Id of the track of the car that recorded."""

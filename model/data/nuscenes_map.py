@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.arrays import Bytes, Floats
-from model.scene import Raster
+from model.scenes.scene import Raster
 
 PIXELS_PER_METER = 3.0
 _DIVIDER_PIXELS = 2

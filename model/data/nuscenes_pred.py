@@ -17,7 +17,7 @@ from PIL import Image
 from model.arrays import Floats
 from model.data.checks import check_pairs
 from model.data.scenes import DataError, Pair, SceneRecord, Track
-from model.scene import AgentType, Raster
+from model.scenes.scene import AgentType, Raster
 
 _FOLDERS = {"train": "train", "train_main": "train", "train_fold": "train", "train_val": "val"}
 """The challenge's train_val is the folder val: AgentFormer evaluates on what the challenge validates on."""

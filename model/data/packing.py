@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from model.arrays import Bytes, Float32s
-from model.scene import Raster
+from model.scenes.scene import Raster
 
 LAYERS = 3
 """Bit 0 driveable area, bit 1 road dividers, bit 2 lane dividers."""

@@ -1,6 +1,6 @@
 """Map patches of agents of many scenes at once, cut from packed rasters on any device.
 
-The same patches as ``model.raster.cut_patches``; here all agents of a batch share one look-up.
+The same patches as ``model.scenes.raster.cut_patches``; here all agents of a batch share one look-up.
 """
 
 import numpy as np
@@ -10,7 +10,7 @@ from torch import Tensor
 from model.arrays import Floats, Ints
 from model.data.cache import Cache
 from model.data.packing import LAYERS
-from model.raster import COLUMNS_RIGHT, PATCH_PIXELS_PER_METER, PATCH_SIZE, ROWS_BEHIND
+from model.scenes.raster import COLUMNS_RIGHT, PATCH_PIXELS_PER_METER, PATCH_SIZE, ROWS_BEHIND
 
 _CHUNK = {"cpu": 8}
 """Agents at once: on a CPU what they need stays in its cache."""

@@ -1,6 +1,6 @@
 """A frame of a recorded scene as forecasters see it, under either protocol of the inputs.
 
-Both go through ``model.resample``, as the server's requests do, so that training and serving share one
+Both go through ``model.scenes.resample``, as the server's requests do, so that training and serving share one
 derivation.
 
 - causal: positions and headings up to the present; the rest is derived from them, as for a client that
@@ -17,9 +17,9 @@ from model.arrays import Bools, Floats, Ints
 from model.data.scenes import SceneRecord
 from model.forecaster import Protocol
 from model.geometry import wrap_angle
-from model.observations import Observations
-from model.resample import resample
-from model.scene import STEP_SECONDS, AgentStates, Scene
+from model.scenes.observations import Observations
+from model.scenes.resample import resample
+from model.scenes.scene import STEP_SECONDS, AgentStates, Scene
 
 _OLDER_FRAMES = 4
 """Frames before the history that its states can depend on: two of differences, and the one or two that a

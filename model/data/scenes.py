@@ -8,7 +8,7 @@ import numpy as np
 
 from model.arrays import Bools, Floats, Ints
 from model.metrics.standing import STANDING_FRAMES, stood
-from model.scene import AgentType, Raster
+from model.scenes.scene import AgentType, Raster
 
 
 class DataError(Exception):

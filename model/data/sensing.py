@@ -2,7 +2,7 @@
 
 Recorded scenes have clean poses at 2 Hz. A service gets observations at any rate, with noise, with and
 without headings and velocities, with gaps, of agents first seen a moment ago. Here such observations are
-drawn from recorded tracks, and brought onto the grid by ``model.resample``, as the server does.
+drawn from recorded tracks, and brought onto the grid by ``model.scenes.resample``, as the server does.
 
 Between recorded poses an agent moves along a cubic Hermite spline. Its tangent now comes from the past alone
 (a parabola through the last three poses): a tangent from both sides would put the next position into the
@@ -19,9 +19,9 @@ from model.data.protocols import SceneFrames
 from model.data.scenes import SceneRecord
 from model.forecaster import Protocol
 from model.geometry import wrap_angle
-from model.observations import Observations
-from model.resample import resample
-from model.scene import STEP_SECONDS, AgentStates, Scene
+from model.scenes.observations import Observations
+from model.scenes.resample import resample
+from model.scenes.scene import STEP_SECONDS, AgentStates, Scene
 
 RATES_HZ = (2.0, 4.0, 5.0, 10.0, 20.0)
 _RATE_SHARES = (0.3, 0.1, 0.1, 0.35, 0.15)

@@ -29,7 +29,7 @@ from model.data.synthetic_roads import (
 )
 from model.data.synthetic_traffic import TICK, Drives, Vehicle, clear, draw_driver, simulate, wander
 from model.geometry import rotate, wrap_angle
-from model.scene import STEP_SECONDS, AgentType
+from model.scenes.scene import STEP_SECONDS, AgentType
 
 SCENES = {"train": 1000, "validation": 60, "hard": 500}
 """Scenes by split; those of ``hard`` are of the kinds in ``_HARD``."""

@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw
 
 from model.arrays import Floats
 from model.geometry import rotate, wrap_angle
-from model.scene import Raster
+from model.scenes.scene import Raster
 
 STEP = 0.5
 """m between points of lines."""

@@ -18,7 +18,7 @@ from model.baselines.kalman import HISTORY_FRAMES
 from model.metrics.aggregate import MetricMeans
 from model.metrics.evaluate import instance_metrics
 from model.metrics.oracle import ORACLE, oracle_figures, oracle_mixture
-from model.scene import AgentType, Raster
+from model.scenes.scene import AgentType, Raster
 
 
 @dataclass(frozen=True)

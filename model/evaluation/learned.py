@@ -15,7 +15,7 @@ from model.evaluation.subjects import Learned
 from model.forecaster import Protocol
 from model.metrics.aggregate import MetricMeans
 from model.networks.config import AnyNetworkConfig, NetworkConfig
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 from model.training.validation import Validation
 
 

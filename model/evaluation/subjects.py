@@ -11,7 +11,7 @@ from model.forecaster import Forecaster, ModelInfo, Protocol
 from model.metrics.oracle import ORACLE
 from model.networks.config import AnyNetworkConfig
 from model.registry import load_checkpoints
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 
 
 class EvaluationError(Exception):

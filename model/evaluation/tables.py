@@ -9,7 +9,7 @@ from model.evaluation.results import Results, Row
 from model.evaluation.text_tables import NOTHING, Table, document, metrics_table, number
 from model.metrics.displacement import HORIZONS_S
 from model.metrics.standing import STANDING_FRAMES, STANDING_M
-from model.scene import STEP_SECONDS
+from model.scenes.scene import STEP_SECONDS
 
 MERGED = {
     "minADE_5": "merged_min_ade_5_m",

@@ -9,8 +9,8 @@ from model.arrays import Bools, Bytes, Float32s, Floats, Ints
 from model.forecaster import Context, Features
 from model.geometry import rotate, wrap_angle
 from model.networks.config import NetworkConfig
-from model.raster import FAR, NEAR, PatchGeometry, cut_patches
-from model.scene import AgentStates, AgentType, Scene
+from model.scenes.raster import FAR, NEAR, PatchGeometry, cut_patches
+from model.scenes.scene import AgentStates, AgentType, Scene
 
 HISTORY_SCALE = np.array([20.0, 5.0, 15.0, 5.0, 3.0, 3.0, 0.5, 0.5])
 """What x, y, vx, vy, ax, ay, heading and heading rate of a history are divided by (m, m/s, m/s², rad, rad/s).

@@ -7,7 +7,7 @@ from model.arrays import Ints
 from model.features.scene_features import scene_features
 from model.forecaster import Context, Features
 from model.networks.config import AnyNetworkConfig, Frame, NetworkConfig
-from model.scene import AgentType, Scene
+from model.scenes.scene import AgentType, Scene
 from model.features.neighbor_boxes import surroundings
 
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from model.arrays import Float32s, Floats, Ints
 from model.geometry import rotate, wrap_angle
-from model.raster import COLUMNS_RIGHT, PATCH_PIXELS_PER_METER, PATCH_SIZE, ROWS_BEHIND
-from model.scene import AgentType, Scene
+from model.scenes.raster import COLUMNS_RIGHT, PATCH_PIXELS_PER_METER, PATCH_SIZE, ROWS_BEHIND
+from model.scenes.scene import AgentType, Scene
 
 BOXES = 32
 """S, of an agent at most; the nearest count."""

@@ -4,7 +4,7 @@ import numpy as np
 
 from model.arrays import Floats, Ints
 from model.geometry import wrap_angle
-from model.scene import AgentStates, AgentType
+from model.scenes.scene import AgentStates, AgentType
 from model.features.standardization import ATTENTION_RADIUS, HEADING, STATE_SIZE, state_scale, state_vectors
 
 _RAMP = np.array([0.25, 0.5, 0.75, 1.0])

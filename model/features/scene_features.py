@@ -8,8 +8,8 @@ from model.forecaster import Context, Features
 from model.geometry import wrap_angle
 from model.features.neighbors import edge_ramps, neighbor_sums
 from model.networks.config import NetworkConfig
-from model.raster import PATCH_SIZE, cut_patches
-from model.scene import AgentStates, AgentType, Scene
+from model.scenes.raster import PATCH_SIZE, cut_patches
+from model.scenes.scene import AgentStates, AgentType, Scene
 from model.features.standardization import HEADING, state_scale, state_vectors
 
 

@@ -7,7 +7,7 @@ frame.
 import numpy as np
 
 from model.arrays import Floats
-from model.scene import AgentStates, AgentType
+from model.scenes.scene import AgentStates, AgentType
 
 STATE_SIZE = {AgentType.VEHICLE: 8, AgentType.PEDESTRIAN: 6}
 """Length of a type's state vector; types that are not here have no network."""

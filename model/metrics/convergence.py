@@ -9,7 +9,7 @@ import numpy as np
 
 from model.arrays import Floats
 from model.metrics.displacement import displacement_m
-from model.scene import STEP_SECONDS
+from model.scenes.scene import STEP_SECONDS
 
 RANGES_M = (0.2, 1.0, 5.0)
 """τ of the paper's table."""

@@ -7,7 +7,7 @@ nuscenes-devkit ``mean_distances``, ``final_distances``).
 import numpy as np
 
 from model.arrays import Floats
-from model.scene import STEP_SECONDS
+from model.scenes.scene import STEP_SECONDS
 
 HORIZONS_S = (1, 2, 3, 4, 5, 6)
 """Those of the paper's tables."""

@@ -8,7 +8,7 @@ import numpy as np
 from model.arrays import Bools, Floats
 from model.metrics import density, displacement, multimodal, offroad
 from model.mixture import TrajectoryMixture, merge_modes
-from model.scene import Raster
+from model.scenes.scene import Raster
 
 SAMPLES: Final = 2000
 """Trajectories that the paper draws for ADE-f, FDE-f and OffR-f."""

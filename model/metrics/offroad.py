@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from model.arrays import Bools, Floats
-from model.scene import Raster
+from model.scenes.scene import Raster
 
 DRIVEABLE_LAYER = 0
 

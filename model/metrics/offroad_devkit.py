@@ -15,7 +15,7 @@ import numpy as np
 
 from model.arrays import Floats
 from model.metrics.offroad import DRIVEABLE_LAYER
-from model.scene import Raster
+from model.scenes.scene import Raster
 
 POINTS = 200
 """On a spline."""

@@ -28,8 +28,8 @@ from model.forecaster import Context, Features
 from model.networks.config import NetworkConfig
 from model.networks.dynamics import Positions
 from model.networks.recurrent import HistoryLSTM
-from model.raster import FAR, PatchGeometry
-from model.scene import STEP_SECONDS, AgentType
+from model.scenes.raster import FAR, PatchGeometry
+from model.scenes.scene import STEP_SECONDS, AgentType
 from model.features.standardization import STATE_SIZE
 
 STEPS = 12

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, NonNegativeFloat, Tag, model_validator
 
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 from model.features.standardization import STATE_SIZE
 
 HIDDEN = 32

@@ -9,7 +9,7 @@ from model.networks.config import CoverNetConfig
 from model.networks.rasterize_boxes import draw_boxes
 from model.networks.dynamics import Positions
 from model.networks.encoders import ConvShape, MapEncoder
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 from model.features.standardization import HEADING, state_scale
 from model.baselines.uncertainty import oriented_covariance
 

@@ -9,7 +9,7 @@ from model.networks.forecaster import NetworkForecaster, Networks
 from model.networks.agent_frame import AgentFrameNetwork
 from model.networks.config import Frame, NetworkConfig
 from model.networks.network import AgentNetwork
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 
 
 class CvaeNetworks(Networks[AgentNetwork | AgentFrameNetwork]):

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from model.scene import STEP_SECONDS
+from model.scenes.scene import STEP_SECONDS
 
 STRAIGHT_BELOW = 0.01
 """rad/s; slower turning is no turning: the heading stays and its uncertainty does not grow, as in the

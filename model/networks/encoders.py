@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from model.networks.config import HIDDEN
 from model.networks.recurrent import HistoryLSTM
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 
 RNN_DROPOUT = 0.25
 MAP_DROPOUT = 0.5

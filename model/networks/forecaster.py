@@ -13,7 +13,7 @@ from model.forecaster import Context, Features, Forecaster, ModelInfo
 from model.features.inputs import network_features
 from model.mixture import TrajectoryMixture
 from model.networks.config import AnyNetworkConfig, NetworkConfig
-from model.scene import AgentType, Scene
+from model.scenes.scene import AgentType, Scene
 from model.baselines.unimodal import require_observed
 
 SMALLEST_VARIANCE = 1e-6

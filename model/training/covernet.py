@@ -9,7 +9,7 @@ from torch import Tensor
 from model.covernet import CoverNetworks
 from model.networks.config import CoverNetConfig
 from model.networks.covernet import present_heading, turned
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 from model.training.config import TrainingConfig, TrainingError
 from model.training.cover import make_cover, summed_distances
 from model.training.learner import Batch, DescentLearner

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from model.forecaster import Context
 from model.networks.covernet import present_heading, turned
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 from model.features.standardization import FUTURE_POSITION_SCALE
 from model.training.config import TrainingConfig
 from model.training.discriminator import Discriminator, Verdict

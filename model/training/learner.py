@@ -18,7 +18,7 @@ from model.networks.agent_frame import AgentFrameNetwork
 from model.networks.config import NetworkConfig
 from model.networks.covernet import turned
 from model.networks.network import AgentNetwork
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 from model.training.config import Method, TrainingConfig
 from model.training.dropout import scale_dropout
 from model.training.mixture_objective import mixture_objective

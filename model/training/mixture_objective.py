@@ -18,7 +18,7 @@ from torch import Tensor
 from model.features.agent_features import NEIGHBOR_VELOCITY_SCALE
 from model.forecaster import Context, Features
 from model.networks.agent_frame import AgentFrameNetwork, Modes, Path, drives_through, read_patch
-from model.raster import FAR
+from model.scenes.raster import FAR
 from model.training.elbo import divergence
 from model.training.objectives import Loss
 

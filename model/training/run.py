@@ -16,7 +16,7 @@ from model.data.scenes import Reader
 from model.data.sources import READERS
 from model.forecaster import ModelInfo, Protocol
 from model.networks.agent_frame import AgentFrameNetwork
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 from model.training import processes
 from model.training.calibration import (
     AnyCalibration,

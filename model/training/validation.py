@@ -17,7 +17,7 @@ from model.metrics.standing import stood
 from model.mixture import TrajectoryMixture
 from model.networks.forecaster import Networks
 from model.networks.config import AnyNetworkConfig
-from model.scene import AgentType, Raster
+from model.scenes.scene import AgentType, Raster
 
 BATCH = 512
 

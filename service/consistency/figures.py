@@ -9,8 +9,8 @@ from model.arrays import Bools, Floats
 from model.metrics.convergence import RANGES_M, convergence_s, errors_by_age_m
 from model.metrics.dispersion import Dispersion, dispersion
 from model.metrics.displacement import displacement_m
-from model.resample import TIME_TOLERANCE
-from model.scene import STEP_SECONDS
+from model.scenes.resample import TIME_TOLERANCE
+from model.scenes.scene import STEP_SECONDS
 from service.history.records import AGES, COMPLETE, NEWLY, SETTLED, unpack_instants
 
 AGES_S = STEP_SECONDS * np.arange(1, AGES + 1)

@@ -17,9 +17,9 @@ from google.protobuf.descriptor import FieldDescriptor
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.arrays import Bools, Bytes, Float32s, Floats, Ints
-from model.observations import JUMP_SLACK, MAX_SPEED, Observations
-from model.resample import MAX_AGE, TIME_TOLERANCE
-from model.scene import AgentType
+from model.scenes.observations import JUMP_SLACK, MAX_SPEED, Observations
+from model.scenes.resample import MAX_AGE, TIME_TOLERANCE
+from model.scenes.scene import AgentType
 from service.core.images import decode_layers
 from service.core.options import MAX_POSITION, MAX_TIME
 from service.errors import BadField, Fault

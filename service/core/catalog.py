@@ -8,7 +8,7 @@ import structlog
 from cab.forecast.v1 import model_service_pb2 as pb
 from model.forecaster import Forecaster, ModelInfo, Protocol
 from model.registry import UnknownModelError
-from model.scene import STEP_SECONDS, AgentType
+from model.scenes.scene import STEP_SECONDS, AgentType
 from service.errors import UnknownModel
 from service.settings import FALLBACK_MODEL, SettingsError
 

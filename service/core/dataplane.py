@@ -19,7 +19,7 @@ import torch
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.forecaster import Forecaster
-from model.resample import history_seconds
+from model.scenes.resample import history_seconds
 from service.consistency.plane import ConsistencyPlane
 from service.consistency.tracker import Tracked, Tracker
 from service.core.agents import Agents, read_agents

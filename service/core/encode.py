@@ -10,7 +10,7 @@ import torch
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.arrays import Bools, Floats, Ints
 from model.mixture import TrajectoryMixture, merge_modes
-from model.scene import STEP_SECONDS
+from model.scenes.scene import STEP_SECONDS
 from service.core.batcher import Outcome
 from service.core.catalog import reference
 from service.core.options import Options

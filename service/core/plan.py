@@ -9,8 +9,8 @@ import torch
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.arrays import Ints
 from model.forecaster import Context, Forecaster, Protocol
-from model.resample import MAX_AGE, MAX_GAP, MIN_DIFFERENCE_SPAN, resample
-from model.scene import AgentType, Raster, Scene
+from model.scenes.resample import MAX_AGE, MAX_GAP, MIN_DIFFERENCE_SPAN, resample
+from model.scenes.scene import AgentType, Raster, Scene
 from service.core.agents import Agents, read_agents
 from service.core.batcher import Job
 from service.core.catalog import Catalog

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from model.metrics.offroad import off_road
-from model.scene import Raster
+from model.scenes.scene import Raster
 from service.core.encode import Result
 
 

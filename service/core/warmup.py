@@ -7,7 +7,7 @@ import structlog
 import torch
 
 from model.forecaster import Context, Features, Forecaster, agent_count, join
-from model.scene import STEP_SECONDS, AgentStates, AgentType, Raster, Scene
+from model.scenes.scene import STEP_SECONDS, AgentStates, AgentType, Raster, Scene
 from service.core.batcher import Batcher, Job
 from service.core.catalog import Catalog
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from model.arrays import Floats, Ints
 from model.mixture import TrajectoryMixture
-from model.observations import Observations
-from model.scene import AgentType
+from model.scenes.observations import Observations
+from model.scenes.scene import AgentType
 
 AGES = 12
 """Ages at which forecasts are put beside each other: k · 0.5 s, k = 1 … 12."""

@@ -8,7 +8,7 @@ import asyncio
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from model.resample import TIME_TOLERANCE
+from model.scenes.resample import TIME_TOLERANCE
 from service.history.entry import Entry
 from service.history.sighted import Sighted
 from service.history.store import LATENESS, WINDOW, Fate

@@ -3,8 +3,8 @@
 from bisect import bisect_left, bisect_right, insort
 from typing import NamedTuple
 
-from model.resample import TIME_TOLERANCE
-from model.scene import STEP_SECONDS
+from model.scenes.resample import TIME_TOLERANCE
+from model.scenes.scene import STEP_SECONDS
 from service.history.records import AGES, BLOCK
 from service.history.store import AGE_TOLERANCE, MAX_FORECASTS
 

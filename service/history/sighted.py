@@ -2,8 +2,8 @@
 
 import struct
 
-from model.observations import JUMP_SLACK, MAX_SPEED
-from model.resample import TIME_TOLERANCE
+from model.scenes.observations import JUMP_SLACK, MAX_SPEED
+from model.scenes.resample import TIME_TOLERANCE
 from service.history.records import OBSERVATION_BYTES
 
 SAME_PLACE = 0.1

@@ -6,7 +6,7 @@ from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from model.scene import STEP_SECONDS
+from model.scenes.scene import STEP_SECONDS
 from service.history.records import AGES, COMPLETE, NEWLY, SETTLED
 from service.history.series import REACH, Series, Set
 from service.history.sighted import Sighted

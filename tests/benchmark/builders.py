@@ -12,7 +12,7 @@ from benchmark.results import Latency, ModelResult, Results
 from model.forecaster import Protocol
 from model.metrics.convergence import RANGES_M
 from model.metrics.evaluate import MOVING, MOVING_FIGURES
-from model.scene import Raster
+from model.scenes.scene import Raster
 
 NAMES = (
     "cab",

@@ -9,7 +9,7 @@ from PIL import Image
 
 from benchmark.plan import PlannedScene, plan_scenes
 from model.data.scenes import SceneRecord
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 from tests.model.data.records import FixedReader, record
 
 RECORDS = (record(), record("scene-2", seed=1))

@@ -14,8 +14,8 @@ from model.data.protocols import SceneFrames
 from model.features.scene_features import scene_features
 from model.forecaster import Context, Protocol
 from model.networks.config import NetworkConfig
-from model.resample import resample
-from model.scene import AgentStates, AgentType, Raster, Scene
+from model.scenes.resample import resample
+from model.scenes.scene import AgentStates, AgentType, Raster, Scene
 from service.core.agents import read_agents
 from service.settings import Settings
 from tests.benchmark.scenes import planned

@@ -12,7 +12,7 @@ from cab.forecast.v1 import prediction_service_pb2 as pb
 from cab_forecast import agent, map_patch, predict_request, scene_raster
 from model.arrays import Bools, Floats
 from model.geometry import rotate
-from model.scene import Raster
+from model.scenes.scene import Raster
 
 CAR = "car"
 """Id of the agent that is asked about."""

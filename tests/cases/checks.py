@@ -10,7 +10,7 @@ from cab_forecast import Forecast, Status
 from model.arrays import Floats, Ints
 from model.metrics.offroad import driveable
 from model.mixture import TrajectoryMixture, merge_modes
-from model.scene import STEP_SECONDS, Raster
+from model.scenes.scene import STEP_SECONDS, Raster
 from tests.cases.case import Frame
 
 SAMPLES = 2000

@@ -8,7 +8,7 @@ from google.protobuf import json_format
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from cab_forecast.layers import decode_layers
-from model.scene import Raster
+from model.scenes.scene import Raster
 from tests.cases.case import CAR, Case, Facts, Frame, Row
 
 _CLEAN = "straight_10_clean"

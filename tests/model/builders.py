@@ -6,7 +6,7 @@ from typing import TypeAlias
 import numpy as np
 
 from model.arrays import Floats
-from model.observations import Observations
+from model.scenes.observations import Observations
 
 Path: TypeAlias = Callable[[Floats], Floats]
 """Times [S] → values [S, …]."""

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from model.arrays import Bytes, Float32s, Floats
 from model.geometry import rotate, wrap_angle
-from model.scene import AgentStates, AgentType, Scene
+from model.scenes.scene import AgentStates, AgentType, Scene
 
 
 def present(

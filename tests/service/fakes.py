@@ -11,7 +11,7 @@ from model.arrays import Ints
 from model.forecaster import Context, Features, Forecaster, ModelInfo, Protocol, agent_count
 from model.mixture import TrajectoryMixture
 from model.registry import Registry
-from model.scene import AgentType, Scene
+from model.scenes.scene import AgentType, Scene
 
 
 class FakeForecaster(Forecaster):

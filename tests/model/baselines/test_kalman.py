@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from model.arrays import Floats
 from model.forecaster import join
 from model.baselines.kalman import HISTORY_FRAMES, NOISE, Kalman, Noise
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 from tests.model.scenes import present, tracks
 
 KALMAN = Kalman()

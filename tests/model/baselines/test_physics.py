@@ -9,7 +9,7 @@ from model.arrays import Floats
 from model.forecaster import Context, Protocol, agent_count, join
 from model.mixture import TrajectoryMixture
 from model.baselines.physics import Physics, baselines
-from model.scene import AgentStates, AgentType, Scene
+from model.scenes.scene import AgentStates, AgentType, Scene
 from model.baselines.uncertainty import Growth, Spread, SpreadBySpeed, aligned_covariance, ellipse_radius
 from tests.model.scenes import present
 

@@ -13,7 +13,7 @@ from model.convert import ConversionError, UnsafePickleError, convert_trajectron
 from model.networks.cvae import CvaeForecaster
 from model.forecaster import Context, Protocol
 from model.networks.network import AgentNetwork
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 from tests.model.convert.assembler import call, legacy_file, module, named, text
 
 

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from model.data.scenes import DataError, Pair, SceneRecord, Track
 from model.geometry import rotate, wrap_angle
-from model.scene import AgentType, Raster
+from model.scenes.scene import AgentType, Raster
 
 
 def track(

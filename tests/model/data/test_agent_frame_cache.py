@@ -17,7 +17,7 @@ from model.data.protocols import frame_scene
 from model.data.scenes import DataError, Pair, SceneRecord, Track
 from model.forecaster import Context, Protocol
 from model.networks.config import Frame, NetworkConfig
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 from tests.model.data.records import FixedReader, record
 
 CONFIG = NetworkConfig(frame=Frame.AGENT, far_map=True)

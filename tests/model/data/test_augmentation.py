@@ -11,7 +11,7 @@ from model.data.scenes import SceneRecord
 from model.features.scene_features import scene_features
 from model.forecaster import Context, Features, Protocol
 from model.networks.config import NetworkConfig
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 from model.features.standardization import HEADING
 from tests.model.data.records import record, turned
 

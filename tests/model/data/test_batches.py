@@ -17,7 +17,7 @@ from model.forecaster import Context, Protocol, join
 from model.networks.config import CoverNetConfig, NetworkConfig
 from model.networks.covernet import present_heading
 from model.networks.covernet import turned as turned_vectors
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 from tests.model.data.records import FixedReader, raster, record, turned
 
 CONFIG = NetworkConfig()

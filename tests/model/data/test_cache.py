@@ -15,7 +15,7 @@ from model.features.scene_features import scene_features
 from model.forecaster import Context, Protocol
 from model.features.inputs import network_features
 from model.networks.config import AnyNetworkConfig, BlindContext, CoverNetConfig, NetworkConfig
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 from tests.model.data.records import FixedReader, raster, record, track
 
 FRAMES = 5

@@ -9,7 +9,7 @@ from loadtest.forward import features_in_agent_frame
 from model.data import jittering
 from model.data.jittering import MAX_SHIFT_M, MAX_STRETCH, jitter, moved, stretched
 from model.networks.agent_frame import read_patch
-from model.raster import FAR, NEAR
+from model.scenes.raster import FAR, NEAR
 
 
 def test_a_history_is_noisy_where_it_was_observed_and_ends_at_the_origin(

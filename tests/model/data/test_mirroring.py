@@ -13,7 +13,7 @@ from model.features.scene_features import scene_features
 from model.forecaster import Context, Features, Protocol
 from model.networks.config import Frame, NetworkConfig
 from model.networks.rasterize_boxes import draw_boxes
-from model.scene import AgentType, Raster
+from model.scenes.scene import AgentType, Raster
 from model.features.standardization import HEADING
 from model.features.neighbor_boxes import surroundings
 from tests.model.data.records import record

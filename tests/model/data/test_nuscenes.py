@@ -15,7 +15,7 @@ from model.data.nuscenes import EGO, MARGIN, NuscenesReader
 from model.data.nuscenes_pred import NuscenesPredReader
 from model.data.scenes import DataError, SceneRecord, Track
 from model.geometry import wrap_angle
-from model.scene import AgentType, Raster
+from model.scenes.scene import AgentType, Raster
 from tests.model.data.dataroot import LOCATION, POSES, SAMPLES, SCENE, token, write_dataroot
 
 INSTALLED = find_spec("nuscenes") is not None

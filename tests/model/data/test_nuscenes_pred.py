@@ -11,8 +11,8 @@ from model.data.nuscenes_pred import NuscenesPredReader
 from model.data.protocols import frame_scene
 from model.data.scenes import DataError, SceneRecord
 from model.forecaster import Protocol
-from model.resample import resample
-from model.scene import AgentType
+from model.scenes.resample import resample
+from model.scenes.scene import AgentType
 from service.core.agents import read_agents
 from service.settings import Settings
 from tests.nuscenes_pred import real_raster, real_request

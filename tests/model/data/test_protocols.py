@@ -9,8 +9,8 @@ from model.data.protocols import SceneFrames, frame_scene
 from model.data.scenes import Pair, SceneRecord, Track
 from model.forecaster import Protocol
 from model.geometry import wrap_angle
-from model.resample import resample
-from model.scene import AgentStates, AgentType
+from model.scenes.resample import resample
+from model.scenes.scene import AgentStates, AgentType
 from tests.model.builders import observations
 from tests.model.data.records import raster, record, track
 

@@ -12,7 +12,7 @@ from model.data.scenes import DataError, SceneRecord, Track
 from model.data.sources import READERS, parse_data
 from model.data.synthetic import HISTORY_STEPS, SCENES, SyntheticReader
 from model.geometry import wrap_angle
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 
 SAMPLE = 120
 

@@ -12,8 +12,8 @@ from model.arrays import Bytes, Float32s, Ints
 from model.forecaster import Context
 from model.geometry import rotate
 from model.networks.config import Frame, NetworkConfig
-from model.raster import FAR, NEAR, cut_patches
-from model.scene import AgentStates, AgentType, Raster, Scene
+from model.scenes.raster import FAR, NEAR, cut_patches
+from model.scenes.scene import AgentStates, AgentType, Raster, Scene
 from tests.model.scenes import crowd, moved, present
 
 CONFIG = NetworkConfig(frame=Frame.AGENT, far_map=True)

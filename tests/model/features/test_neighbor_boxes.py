@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from model.arrays import Floats
 from model.geometry import rotate, wrap_angle
-from model.scene import AgentStates, AgentType, Scene
+from model.scenes.scene import AgentStates, AgentType, Scene
 from model.features.neighbor_boxes import BOX_SIZE, BOXES, surroundings
 
 BOTH = (AgentType.VEHICLE, AgentType.PEDESTRIAN)

@@ -5,7 +5,7 @@ import torch
 
 from model.arrays import Bytes
 from model.mixture import TrajectoryMixture
-from model.scene import Raster
+from model.scenes.scene import Raster
 
 
 def random_mixture(seed: int, agents: int = 3, modes: int = 4, steps: int = 12) -> TrajectoryMixture:

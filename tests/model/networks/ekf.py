@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.func import jacrev, vmap
 
 from model.networks.dynamics import STRAIGHT_BELOW, Controls
-from model.scene import STEP_SECONDS
+from model.scenes.scene import STEP_SECONDS
 
 
 def _curved(state: Tensor, control: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from model.forecaster import Features
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 from model.features.standardization import state_scale
 
 TYPES = (AgentType.VEHICLE, AgentType.PEDESTRIAN)

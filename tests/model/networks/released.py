@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from model.networks.dynamics import STRAIGHT_BELOW, Controls, Positions
-from model.scene import STEP_SECONDS as DT
+from model.scenes.scene import STEP_SECONDS as DT
 
 FLOAT32_ROUNDING = 2.0**-24
 """Relative, of one operation."""

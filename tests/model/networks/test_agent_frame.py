@@ -17,8 +17,8 @@ from model.networks.cvae import CvaeForecaster, CvaeNetworks
 from model.forecaster import Context, Features
 from model.networks.agent_frame import STEPS, AgentFrameNetwork, Modes, drive, read_patch
 from model.networks.config import BlindContext, Frame, NetworkConfig
-from model.raster import FAR, NEAR, PatchGeometry
-from model.scene import AgentType
+from model.scenes.raster import FAR, NEAR, PatchGeometry
+from model.scenes.scene import AgentType
 from tests.model.scenes import crowd, moved
 
 CONFIG = NetworkConfig(frame=Frame.AGENT, far_map=True, blind=BlindContext.NULL)

@@ -15,7 +15,7 @@ from model.geometry import rotate, wrap_angle
 from model.networks.config import CoverNetConfig
 from model.networks.covernet import CoverNet
 from model.registry import Registry
-from model.scene import AgentType, Scene
+from model.scenes.scene import AgentType, Scene
 from tests.model.checkpoints import info
 from tests.model.networks.test_cvae import TYPES, VEHICLES, scene
 

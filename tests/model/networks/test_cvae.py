@@ -11,8 +11,8 @@ from loadtest.forward import cab_network
 from model.networks.cvae import CvaeForecaster, CvaeNetworks
 from model.forecaster import Context, ModelInfo, join
 from model.networks.config import BlindContext, NetworkConfig
-from model.resample import resample
-from model.scene import AgentType, Raster, Scene
+from model.scenes.resample import resample
+from model.scenes.scene import AgentType, Raster, Scene
 from tests.model.builders import observations
 
 NOW = 1_700_000_000.0

@@ -25,7 +25,7 @@ from model.networks.cvae import CvaeNetworks
 from model.forecaster import Context
 from model.networks.config import BlindContext, NetworkConfig
 from model.networks.network import AgentNetwork
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 from tests.model.networks.ekf import unicycle
 from tests.model.networks.golden import TYPES, double, golden_features
 

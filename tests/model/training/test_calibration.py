@@ -14,7 +14,7 @@ from model.networks.config import BlindContext, NetworkConfig
 from model.networks.covernet import CoverNet
 from model.networks.dynamics import Positions
 from model.networks.network import AgentNetwork
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 from model.training.calibration import LEAST, MOST, Calibration, _least, calibrate, fit_calibration
 from model.training.config import Method
 from model.training.covernet import CoverNetLearner

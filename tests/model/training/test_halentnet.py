@@ -8,7 +8,7 @@ import torch
 from model.forecaster import Context
 from model.networks.config import NetworkConfig
 from model.networks.network import AgentNetwork
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 from model.training.config import Method
 from model.training.halentnet import FIRST_SWITCH, LAST_SWITCH, STEPS, HalentLearner
 from model.training.learner import Batch

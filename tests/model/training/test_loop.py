@@ -15,7 +15,7 @@ from model.forecaster import Context
 from model.networks.forecaster import Networks
 from model.networks.config import NetworkConfig
 from model.networks.covernet import CoverNet
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 from model.training.config import Method, TrainingConfig, TrainingError, load_config
 from model.training.dropout import scale_dropout
 from model.training.learner import Batch

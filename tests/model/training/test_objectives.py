@@ -21,7 +21,7 @@ from model.forecaster import Context, Features
 from model.networks import network as network_module
 from model.networks.config import BlindContext, NetworkConfig
 from model.networks.network import AgentNetwork
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 from model.training.elbo import (
     LEAST_KL,
     clamped_divergence,

@@ -15,7 +15,7 @@ from model.data.sources import READERS, parse_data
 from model.forecaster import Protocol
 from model.networks.config import BlindContext, CoverNetConfig, Frame, NetworkConfig
 from model.registry import Registry
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 from model.training.calibration import MOST, Calibration
 from model.training.card import RAN_AWAY
 from model.training.config import Method

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 from service.core.agents import read_agents
 from service.errors import Fault
 from service.settings import Settings

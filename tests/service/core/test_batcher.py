@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from model.forecaster import Context, Features
-from model.scene import AgentType
+from model.scenes.scene import AgentType
 from service.core.batcher import Admission, Batcher, Job, Outcome
 from service.errors import DeadlineExceeded, Internal, Overloaded, Unavailable
 from service.telemetry.metrics import Metrics

@@ -5,7 +5,7 @@ import torch
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.mixture import TrajectoryMixture
-from model.scene import Raster
+from model.scenes.scene import Raster
 from service.core.encode import Result
 from service.core.plan import Draft
 from service.core.road import count_off_road

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from model.mixture import TrajectoryMixture
-from model.observations import Observations
+from model.scenes.observations import Observations
 from service.history.records import (
     BLOCK,
     FORECAST_BYTES,

@@ -33,8 +33,8 @@ from numpy.typing import NDArray
 
 from model.arrays import Bools, Floats
 from model.geometry import wrap_angle
-from model.observations import Observations
-from model.scene import STEP_SECONDS
+from model.scenes.observations import Observations
+from model.scenes.scene import STEP_SECONDS
 
 WINDOW = 1.05
 """s; observations this far from a time no longer count for it: what lies before too wide a gap never does."""

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from model.arrays import Bytes, Float32s, Floats
-from model.scene import Raster
+from model.scenes.scene import Raster
 
 PATCH_SIZE = 100
 """Rows and columns of a patch."""

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 
 from model.arrays import Floats
 from model.geometry import wrap_angle
-from model.observations import Observations
-from model.resample import TIME_TOLERANCE, resample
-from model.scene import STEP_SECONDS, AgentStates
+from model.scenes.observations import Observations
+from model.scenes.resample import TIME_TOLERANCE, resample
+from model.scenes.scene import STEP_SECONDS, AgentStates
 from tests.model.builders import Path, observations, track
 
 NOW = 1_700_000_000.0  # seconds since the epoch: float64 has a quarter of a microsecond there

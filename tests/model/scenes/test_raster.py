@@ -8,8 +8,8 @@ from PIL import Image
 
 from model.arrays import Floats
 from model.geometry import rotate
-from model.raster import FAR, NEAR, PATCH_SIZE, PatchGeometry, cut_patches
-from model.scene import Raster
+from model.scenes.raster import FAR, NEAR, PATCH_SIZE, PatchGeometry, cut_patches
+from model.scenes.scene import Raster
 
 
 def _smooth(points: Floats) -> Floats:
