@@ -11,7 +11,7 @@ from model.networks.config import CoverNetConfig
 from model.networks.covernet import present_heading, turned
 from model.scenes.scene import AgentType
 from model.training.config import TrainingConfig, TrainingError
-from model.training.cover import make_cover, summed_distances
+from model.training.trajectory_set import make_cover, summed_distances
 from model.training.learner import Batch, DescentLearner
 from model.training.objectives import Weights
 

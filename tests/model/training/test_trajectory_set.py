@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from model.arrays import Float32s
-from model.training import cover
-from model.training.cover import cover_indices, make_cover, summed_distances
+from model.training import trajectory_set
+from model.training.trajectory_set import cover_indices, make_cover, summed_distances
 
 EPSILON = 2.0
 PATHS = arrays.arrays(
