@@ -16,7 +16,7 @@ from pydantic_settings import (
 )
 
 from service.environment import CONFIG, PREFIX, unknown_variable
-from service.history.address import parse_address
+from service.redis_url import parse_address
 
 FALLBACK_MODEL = "constant-velocity-yaw"
 """The model of agents that the model asked for cannot forecast."""
@@ -36,7 +36,7 @@ class Settings(BaseSettings):
     grpc: str = "127.0.0.1:50051"
     """HOST:PORT of gRPC; port 0 takes a free one."""
     store: str = Field(default="memory", repr=False)
-    """Where agents are remembered: "memory", in this process, or Redis 7 (see ``service.history.address``):
+    """Where agents are remembered: "memory", in this process, or Redis 7 (see ``service.redis_url``):
     redis:// and rediss:// of one server, redis+sentinel:// and redis+cluster://."""
     store_budget_ms: float = Field(default=20.0, gt=0)
     """ms that a call waits for the track memory; later the forecast goes out without it."""

@@ -12,7 +12,7 @@ from redis.exceptions import ConnectionError as RedisConnectionError
 from redis.exceptions import MaxConnectionsError
 from redis.typing import EncodableT
 
-from service.history.address import Endpoint
+from service.redis_url import Endpoint
 
 _SPARE = 4
 """Connections to a node beyond those of commands: for subscriptions."""

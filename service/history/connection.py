@@ -14,7 +14,7 @@ from redis.asyncio.retry import Retry
 from redis.asyncio.sentinel import Sentinel, SentinelConnectionPool
 from redis.backoff import NoBackoff
 
-from service.history.address import Layout, RedisAddress
+from service.redis_url import Layout, RedisAddress
 from service.history.cluster import Cluster
 
 CLIENT_NAME = "cab-forecast"

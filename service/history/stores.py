@@ -1,6 +1,6 @@
 """The track memory that the settings ask for."""
 
-from service.history.address import parse_address
+from service.redis_url import parse_address
 from service.history.memory import MemoryStore
 from service.history.store import TrackStore
 from service.settings import Settings

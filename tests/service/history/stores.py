@@ -4,7 +4,7 @@ import uuid
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-from service.history.address import parse_address
+from service.redis_url import parse_address
 from service.history.connection import connect
 from service.history.memory import MemoryStore
 from service.history.redis_store import RedisStore

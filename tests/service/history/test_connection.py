@@ -16,7 +16,7 @@ from redis.asyncio.cluster import ClusterNode
 from redis.asyncio.sentinel import SentinelConnectionPool
 
 from service.history import cluster
-from service.history.address import Endpoint, Layout, RedisAddress, parse_address
+from service.redis_url import Endpoint, Layout, RedisAddress, parse_address
 from service.history.connection import CLIENT_NAME, connect
 from tests.service.history import redis_servers
 from tests.service.history.redis_servers import HOST, Cluster, FaultProxy, Process, Sentinels

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from redis import exceptions as redis_errors
 
-from service.history.address import parse_address
+from service.redis_url import parse_address
 from service.history.connection import connect
 from service.history.guard import Guard
 from service.history.store import StoreError

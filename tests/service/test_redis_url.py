@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.history.address import Endpoint, Layout, RedisAddress, parse_address
+from service.redis_url import Endpoint, Layout, RedisAddress, parse_address
 
 _words = st.text(st.characters(codec="utf-8"), min_size=1)
 _hosts = st.one_of(
