@@ -13,8 +13,8 @@ from model.registry import DuplicateModelError, Registry
 from service.api.grpc.server import GrpcServer
 from service.api.rest.app import build_app
 from service.api.rest.server import HttpServer
-from service.core.catalog import Models
-from service.core.dataplane import DataPlane
+from service.predict.catalog import Models
+from service.predict.pipeline import DataPlane
 from service.settings import Settings, SettingsError, bundled_models
 from service.telemetry.metrics import Metrics
 

@@ -6,7 +6,7 @@ import grpc
 
 from cab.forecast.v1 import consistency_service_pb2 as pb
 from service.api.grpc.calls import Calls
-from service.core.dataplane import DataPlane
+from service.predict.pipeline import DataPlane
 
 CONSISTENCY_SERVICE = pb.DESCRIPTOR.services_by_name["ConsistencyService"].full_name
 

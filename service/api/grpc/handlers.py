@@ -10,10 +10,10 @@ from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from service.api.grpc.calls import Calls, Context
 from service.api.grpc.consistency import CONSISTENCY_SERVICE, ConsistencyHandlers
-from service.core.dataplane import DataPlane
-from service.core.incoming import LARGE_BYTES, Encoded
-from service.core.sizes import Sizes
-from service.core.wire import read_request
+from service.predict.pipeline import DataPlane
+from service.predict.request_decoder import LARGE_BYTES, Encoded
+from service.predict.request_limits import Sizes
+from service.predict.protobuf_request import read_request
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
 

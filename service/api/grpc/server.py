@@ -8,7 +8,7 @@ from service.api.auth import Tokens
 from service.api.grpc.handlers import SERVICES, Handlers
 from service.api.grpc.health import HEALTH_SERVICE, Health
 from service.api.grpc.interceptor import AuthInterceptor
-from service.core.dataplane import DataPlane
+from service.predict.pipeline import DataPlane
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
 

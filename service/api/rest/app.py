@@ -17,7 +17,7 @@ from service.api.rest.endpoints import Endpoints
 from service.api.rest.openapi import openapi_document
 from service.api.rest.problem import problem_response
 from service.api.rest.sending import HoldUntilSent
-from service.core.dataplane import DataPlane, Phase
+from service.predict.pipeline import DataPlane, Phase
 from service.errors import BadField, MethodNotAllowed, NotFound, ServiceError, Unavailable
 from service.settings import Settings
 from service.telemetry.metrics import Metrics

@@ -14,7 +14,7 @@ from service.api.rest.codec import parse_json
 from service.api.rest.events import EventStream
 from service.api.rest.negotiation import Format, answer_format, request_format
 from service.api.rest.parameters import read_parameters
-from service.core.dataplane import DataPlane
+from service.predict.pipeline import DataPlane
 
 _Request = TypeVar("_Request", bound=Message)
 _MAX_BYTES = 2**16

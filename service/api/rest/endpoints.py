@@ -11,10 +11,10 @@ from service.api.rest import requests
 from service.api.rest.calls import Calls, respond, unless_disconnected
 from service.api.rest.negotiation import Format, answer_format, request_format, timeout
 from service.api.rest.sending import held
-from service.core import wire
-from service.core.dataplane import DataPlane
-from service.core.incoming import LARGE_BYTES, Encoded
-from service.core.sizes import Sizes
+from service.predict import protobuf_request
+from service.predict.pipeline import DataPlane
+from service.predict.request_decoder import LARGE_BYTES, Encoded
+from service.predict.request_limits import Sizes
 from service.settings import Settings
 
 

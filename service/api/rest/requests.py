@@ -9,7 +9,7 @@ from typing import Any
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from service.api.rest.codec import from_document, load_document
-from service.core.sizes import Sizes
+from service.predict.request_limits import Sizes
 from service.errors import TooLarge
 
 _AGENTS = pb.PredictRequest.DESCRIPTOR.fields_by_number[pb.PredictRequest.AGENTS_FIELD_NUMBER].name

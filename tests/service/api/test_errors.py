@@ -214,7 +214,7 @@ async def test_unexpected_exception_tells_nothing(call: Call, monkeypatch: pytes
         raise KeyError("secret")
 
     async with running() as server:
-        monkeypatch.setattr("service.core.dataplane.make_plan", fail)
+        monkeypatch.setattr("service.predict.pipeline.make_plan", fail)
         error = await failure(call(server, make_request(1)))
         check(error, "INTERNAL", 500, "INTERNAL")
         assert "secret" not in str(error)

@@ -14,7 +14,7 @@ from hypothesis import given
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from service.api.rest.codec import parse_json
 from service.api.rest.requests import read_request
-from service.core.sizes import Sizes
+from service.predict.request_limits import Sizes
 from service.errors import BadField, TooLarge
 from service.settings import Settings
 from tests.service.requests import add_agent, make_request

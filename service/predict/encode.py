@@ -11,10 +11,10 @@ from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.arrays import Bools, Floats, Ints
 from model.mixture import TrajectoryMixture, merge_modes
 from model.scenes.scene import STEP_SECONDS
-from service.core.batcher import Outcome
-from service.core.catalog import reference
-from service.core.options import Options
-from service.core.plan import Draft, Plan
+from service.predict.batcher import Outcome
+from service.predict.catalog import reference
+from service.predict.options import Options
+from service.predict.plan import Draft, Plan
 
 
 @dataclass(frozen=True)

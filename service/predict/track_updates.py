@@ -8,9 +8,9 @@ from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.forecaster import Context, Forecaster
 from service.consistency.tracker import Tracked
-from service.core.agents import Agents
-from service.core.encode import Result
-from service.core.plan import Plan
+from service.predict.agents import Agents
+from service.predict.encode import Result
+from service.predict.plan import Plan
 from service.history.records import KINDS, pack_forecasts, pack_observations, unpack_observations
 from service.history.store import Sighting
 

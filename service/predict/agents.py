@@ -20,8 +20,8 @@ from model.arrays import Bools, Bytes, Float32s, Floats, Ints
 from model.scenes.observations import JUMP_SLACK, MAX_SPEED, Observations
 from model.scenes.resample import MAX_AGE, TIME_TOLERANCE
 from model.scenes.scene import AgentType
-from service.core.images import decode_layers
-from service.core.options import MAX_POSITION, MAX_TIME
+from service.predict.images import decode_layers
+from service.predict.options import MAX_POSITION, MAX_TIME
 from service.errors import BadField, Fault
 from service.limits import too_long
 from service.settings import Settings
@@ -51,7 +51,7 @@ if len(_FIELDS) != len(_BOUNDS) or any(
     field.type != FieldDescriptor.TYPE_DOUBLE or field.number != index + 1
     for index, field in enumerate(pb.AgentState.DESCRIPTOR.fields)
 ):
-    raise ImportError("AgentState has changed: service.core.agents reads its wire form")
+    raise ImportError("AgentState has changed: service.predict.agents reads its wire form")
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import torch
 
 from model.forecaster import Context, Features
 from model.scenes.scene import AgentType
-from service.core.batcher import Admission, Batcher, Job, Outcome
+from service.predict.batcher import Admission, Batcher, Job, Outcome
 from service.errors import DeadlineExceeded, Internal, Overloaded, Unavailable
 from service.telemetry.metrics import Metrics
 from tests.service.fakes import FakeForecaster

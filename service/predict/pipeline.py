@@ -22,17 +22,17 @@ from model.forecaster import Forecaster
 from model.scenes.resample import history_seconds
 from service.consistency.plane import ConsistencyPlane
 from service.consistency.tracker import Tracked, Tracker
-from service.core.agents import Agents, read_agents
-from service.core.batcher import Admission, Batcher, Outcome
-from service.core.catalog import Catalog, Models, build_catalog, reference
-from service.core.encode import Result, encode, finite
-from service.core.incoming import Encoded, Reader
-from service.core.options import Options, read_options
-from service.core.plan import Draft, Group, Plan, check_strict, fall_back, frames_of, make_plan
-from service.core.road import count_off_road
-from service.core.threads import set_helper_threads
-from service.core.tracking import observed, report, sightings, with_histories
-from service.core.warmup import warm_up
+from service.predict.agents import Agents, read_agents
+from service.predict.batcher import Admission, Batcher, Outcome
+from service.predict.catalog import Catalog, Models, build_catalog, reference
+from service.predict.encode import Result, encode, finite
+from service.predict.request_decoder import Encoded, Reader
+from service.predict.options import Options, read_options
+from service.predict.plan import Draft, Group, Plan, check_strict, fall_back, frames_of, make_plan
+from service.predict.off_road import count_off_road
+from service.predict.torch_threads import set_helper_threads
+from service.predict.track_updates import observed, report, sightings, with_histories
+from service.predict.warmup import warm_up
 from service.errors import BadField, DeadlineExceeded, Fault, Unavailable, UnknownModel
 from service.history.guard import Guard
 from service.history.store import Sighting

@@ -13,8 +13,8 @@ from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.forecaster import Context, Protocol
 from model.scenes.scene import AgentType
-from service.core.dataplane import DataPlane, Phase
-from service.core.incoming import Encoded
+from service.predict.pipeline import DataPlane, Phase
+from service.predict.request_decoder import Encoded
 from service.errors import BadField, BadFields, DeadlineExceeded, Overloaded, Unavailable, UnknownModel
 from service.settings import FALLBACK_MODEL, SettingsError
 from service.telemetry.metrics import Metrics

@@ -7,7 +7,7 @@ import numpy as np
 
 from model.metrics.offroad import off_road
 from model.scenes.scene import Raster
-from service.core.encode import Result
+from service.predict.encode import Result
 
 
 def count_off_road(raster: Raster | None, results: Sequence[Result]) -> Counter[str]:

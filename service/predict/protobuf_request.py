@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from google.protobuf.message import DecodeError
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
-from service.core.sizes import Sizes
+from service.predict.request_limits import Sizes
 from service.errors import BadField, TooLarge
 
 _AGENTS = pb.PredictRequest.AGENTS_FIELD_NUMBER

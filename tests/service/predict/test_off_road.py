@@ -6,9 +6,9 @@ import torch
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.mixture import TrajectoryMixture
 from model.scenes.scene import Raster
-from service.core.encode import Result
-from service.core.plan import Draft
-from service.core.road import count_off_road
+from service.predict.encode import Result
+from service.predict.plan import Draft
+from service.predict.off_road import count_off_road
 from tests.service.fakes import FakeForecaster
 
 

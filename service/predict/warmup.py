@@ -8,8 +8,8 @@ import torch
 
 from model.forecaster import Context, Features, Forecaster, agent_count, join
 from model.scenes.scene import STEP_SECONDS, AgentStates, AgentType, Raster, Scene
-from service.core.batcher import Batcher, Job
-from service.core.catalog import Catalog
+from service.predict.batcher import Batcher, Job
+from service.predict.catalog import Catalog
 
 _log = structlog.get_logger(__name__)
 

@@ -7,7 +7,7 @@ from PIL import Image
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.arrays import Bytes
-from service.core.png import PngError, pixels_only, read_header
+from service.predict.png import PngError, pixels_only, read_header
 from service.errors import BadField
 
 LAYERS = 3

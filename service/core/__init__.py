@@ -1,1 +1,0 @@
-"""What the server does with a call, whatever transport it came by."""
