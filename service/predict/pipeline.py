@@ -20,8 +20,8 @@ from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.forecaster import Forecaster
 from model.scenes.resample import history_seconds
-from service.consistency.plane import ConsistencyPlane
-from service.consistency.tracker import Tracked, Tracker
+from service.tracking.service import ConsistencyPlane
+from service.tracking.tracker import Tracked, Tracker
 from service.predict.agents import Agents, read_agents
 from service.predict.batcher import Admission, Batcher, Outcome
 from service.predict.catalog import Catalog, Models, build_catalog, reference
@@ -38,7 +38,7 @@ from service.history.guard import Guard
 from service.history.store import Sighting
 from service.history.stores import make_store
 from service.settings import Settings
-from service.telemetry.consistency import ConsistencyCollector, StoreMetrics
+from service.tracking.collector import ConsistencyCollector, StoreMetrics
 from service.telemetry.metrics import Metrics
 
 _log = structlog.get_logger(__name__)

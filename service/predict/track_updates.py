@@ -7,7 +7,7 @@ from typing import TypeAlias
 from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.forecaster import Context, Forecaster
-from service.consistency.tracker import Tracked
+from service.tracking.tracker import Tracked
 from service.predict.agents import Agents
 from service.predict.encode import Result
 from service.predict.plan import Plan

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from time import perf_counter
 
 from cab.forecast.v1 import consistency_service_pb2 as pb
-from service.consistency.figures import figures
-from service.consistency.messages import ReferenceOf, instant_messages
-from service.consistency.statuses import OF_AGENT, OF_SCENE
-from service.consistency.sums import Sums
+from service.tracking.metrics import figures
+from service.tracking.messages import ReferenceOf, instant_messages
+from service.tracking.statuses import OF_AGENT, OF_SCENE
+from service.tracking.aggregates import Sums
 from service.history.guard import Guard
 from service.history.store import Recalled, Sighting, StoreError, TrackStore
 

@@ -4,10 +4,10 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
-from service.consistency.figures import figures
-from service.consistency.sums import Sums
-from service.telemetry.consistency import ConsistencyCollector, StoreMetrics
-from tests.service.consistency.test_figures import instants
+from service.tracking.metrics import figures
+from service.tracking.aggregates import Sums
+from service.tracking.collector import ConsistencyCollector, StoreMetrics
+from tests.service.tracking.test_metrics import instants
 
 
 def test_histograms_of_what_was_settled() -> None:

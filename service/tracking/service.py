@@ -4,10 +4,10 @@ import asyncio
 from collections.abc import AsyncIterator, Callable, Sequence
 
 from cab.forecast.v1 import consistency_service_pb2 as pb
-from service.consistency.figures import Figures, figures
-from service.consistency.messages import ReferenceOf, instant_messages, model_messages
-from service.consistency.sums import Sums
-from service.consistency.tracker import PATIENCE
+from service.tracking.metrics import Figures, figures
+from service.tracking.messages import ReferenceOf, instant_messages, model_messages
+from service.tracking.aggregates import Sums
+from service.tracking.tracker import PATIENCE
 from service.errors import BadField, Overloaded, TrackingUnavailable, UnknownTrack
 from service.history.guard import Guard
 from service.history.store import WINDOW, Remembered, StoreError, TrackStore

@@ -6,8 +6,8 @@ import numpy as np
 
 from model.arrays import Floats, Ints
 from model.metrics.convergence import RANGES_M
-from service.consistency.figures import Figures
-from service.consistency.sketch import Sketches, Spread
+from service.tracking.metrics import Figures
+from service.tracking.quantile_sketch import Sketches, Spread
 from service.history.records import AGES
 
 DISPERSIONS = range(3)

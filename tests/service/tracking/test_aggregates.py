@@ -7,11 +7,11 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from model.arrays import Floats
-from service.consistency.figures import figures
-from service.consistency.sketch import Sketches
-from service.consistency.sums import CONVERGENCES, DISPERSIONS, ERRORS, Sums
+from service.tracking.metrics import figures
+from service.tracking.quantile_sketch import Sketches
+from service.tracking.aggregates import CONVERGENCES, DISPERSIONS, ERRORS, Sums
 from service.history.records import COMPLETE, SETTLED
-from tests.service.consistency.test_figures import instants
+from tests.service.tracking.test_metrics import instants
 
 QUANTILES = (0.0, 0.1, 0.5, 0.9, 0.99, 1.0)
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from model.metrics.convergence import RANGES_M, convergence_s, errors_by_age_m
 from model.metrics.dispersion import dispersion
-from service.consistency.figures import AGES_S, figures
+from service.tracking.metrics import AGES_S, figures
 from service.history.records import AGES, COMPLETE, INSTANT, MODES, NEWLY, SETTLED
 
 

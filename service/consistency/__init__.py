@@ -1,1 +1,0 @@
-"""What the track memory tells: dispersion, convergence-to-range, displacement error, live."""
