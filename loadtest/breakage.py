@@ -8,7 +8,7 @@ from pathlib import Path
 import redis
 
 from loadtest.stores import redis_server
-from tests.service.history.redis_servers import FaultProxy, Process, until
+from tests.service.tracking.store.redis_servers import FaultProxy, Process, until
 
 DELAY = 0.05
 """s that a slow network takes each way; a call waits 20 ms for both."""

@@ -12,8 +12,8 @@ import typer
 
 from cab_forecast import Client
 from loadtest.servers import serving
-from tests.service.history import redis_servers
-from tests.service.history.redis_servers import HOST, Process
+from tests.service.tracking.store import redis_servers
+from tests.service.tracking.store.redis_servers import HOST, Process
 
 _EXPIRY = 3600
 """s; longer than anything here takes."""

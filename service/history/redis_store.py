@@ -19,13 +19,13 @@ import structlog
 from redis.asyncio import Redis
 from redis.exceptions import ReadOnlyError
 
-from service.history.entry import Entry, EntryError, pack_entry, unpack_entry
-from service.history.failures import reason_of, store_error
+from service.tracking.store.log_entry import Entry, EntryError, pack_entry, unpack_entry
+from service.tracking.store.failures import reason_of, store_error
 from service.history.keys import SceneKeys
-from service.history.scene import Outcome, SceneMemory
+from service.tracking.store.scene import Outcome, SceneMemory
 from service.history.scripts import Script
-from service.history.store import Event, Recalled, Remembered, Sighting, TrackStore
-from service.history.track import Instant, bundle
+from service.tracking.store.base import Event, Recalled, Remembered, Sighting, TrackStore
+from service.tracking.store.track import Instant, bundle
 
 _log = structlog.get_logger(__name__)
 

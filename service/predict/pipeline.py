@@ -34,9 +34,9 @@ from service.predict.torch_threads import set_helper_threads
 from service.predict.track_updates import observed, report, sightings, with_histories
 from service.predict.warmup import warm_up
 from service.errors import BadField, DeadlineExceeded, Fault, Unavailable, UnknownModel
-from service.history.guard import Guard
-from service.history.store import Sighting
-from service.history.stores import make_store
+from service.tracking.store.guard import Guard
+from service.tracking.store.base import Sighting
+from service.tracking.store.factory import make_store
 from service.settings import Settings
 from service.tracking.collector import ConsistencyCollector, StoreMetrics
 from service.telemetry.metrics import Metrics

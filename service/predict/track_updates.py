@@ -11,8 +11,8 @@ from service.tracking.tracker import Tracked
 from service.predict.agents import Agents
 from service.predict.encode import Result
 from service.predict.plan import Plan
-from service.history.records import KINDS, pack_forecasts, pack_observations, unpack_observations
-from service.history.store import Sighting
+from service.tracking.store.records import KINDS, pack_forecasts, pack_observations, unpack_observations
+from service.tracking.store.base import Sighting
 
 Status: TypeAlias = "consistency_pb.TrackingStatus.ValueType"
 _SEVERITY = (

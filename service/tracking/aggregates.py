@@ -8,7 +8,7 @@ from model.arrays import Floats, Ints
 from model.metrics.convergence import RANGES_M
 from service.tracking.metrics import Figures
 from service.tracking.quantile_sketch import Sketches, Spread
-from service.history.records import AGES
+from service.tracking.store.records import AGES
 
 DISPERSIONS = range(3)
 """Numbers of the figures that are dispersion, in the order of ``model.metrics.dispersion.Dispersion``, m."""

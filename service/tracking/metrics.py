@@ -11,7 +11,7 @@ from model.metrics.dispersion import Dispersion, dispersion
 from model.metrics.displacement import displacement_m
 from model.scenes.resample import TIME_TOLERANCE
 from model.scenes.scene import STEP_SECONDS
-from service.history.records import AGES, COMPLETE, NEWLY, SETTLED, unpack_instants
+from service.tracking.store.records import AGES, COMPLETE, NEWLY, SETTLED, unpack_instants
 
 AGES_S = STEP_SECONDS * np.arange(1, AGES + 1)
 """[A], s."""

@@ -9,9 +9,9 @@ from service.tracking.messages import ReferenceOf, instant_messages, model_messa
 from service.tracking.aggregates import Sums
 from service.tracking.tracker import PATIENCE
 from service.errors import BadField, Overloaded, TrackingUnavailable, UnknownTrack
-from service.history.guard import Guard
-from service.history.store import WINDOW, Remembered, StoreError, TrackStore
-from service.history.stores import MAX_WATCHERS
+from service.tracking.store.guard import Guard
+from service.tracking.store.base import WINDOW, Remembered, StoreError, TrackStore
+from service.tracking.store.factory import MAX_WATCHERS
 from service.limits import too_long
 
 DEFAULT_WINDOW = 2.0

@@ -1,7 +1,7 @@
 """What became of a memory, in the contract's words."""
 
 from cab.forecast.v1 import consistency_service_pb2 as pb
-from service.history.store import Event, Fate
+from service.tracking.store.base import Event, Fate
 
 OF_AGENT = {
     Fate.KEPT: pb.TRACKING_STATUS_OK,

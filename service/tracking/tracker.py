@@ -11,8 +11,8 @@ from service.tracking.metrics import figures
 from service.tracking.messages import ReferenceOf, instant_messages
 from service.tracking.statuses import OF_AGENT, OF_SCENE
 from service.tracking.aggregates import Sums
-from service.history.guard import Guard
-from service.history.store import Recalled, Sighting, StoreError, TrackStore
+from service.tracking.store.guard import Guard
+from service.tracking.store.base import Recalled, Sighting, StoreError, TrackStore
 
 PATIENCE = 2.0
 """s that those who do not forecast wait for the track memory."""

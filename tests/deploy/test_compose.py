@@ -9,9 +9,9 @@ import yaml
 from service.environment import PREFIX
 from service.settings import Settings, load, split_address
 from tests.deploy.files import DEPLOY, ROOT, job_name, read_yaml
-from tests.service.history.redis_servers import single
-from tests.service.history.sightings import START, sighting
-from tests.service.history.stores import opened, scene_name
+from tests.service.tracking.store.redis_servers import single
+from tests.service.tracking.store.sightings import START, sighting
+from tests.service.tracking.store.stores import opened, scene_name
 
 SERVICES: dict[str, Any] = read_yaml(ROOT / "docker-compose.yml")["services"]
 MANIFESTS = list(yaml.safe_load_all((DEPLOY / "kubernetes/forecast.yml").read_text(encoding="utf-8")))

@@ -12,12 +12,12 @@ import pytest
 from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from cab_forecast import AsyncClient, BadRequest, Overloaded, TrackingUnavailable, UnknownTrack
-from service.history.stores import MAX_WATCHERS
+from service.tracking.store.factory import MAX_WATCHERS
 from service.server import Server
 from tests.nuscenes_pred import real_tracks
 from tests.service.fakes import FakeForecaster
-from tests.service.history.redis_servers import free_port, single
-from tests.service.history.stores import scene_name
+from tests.service.tracking.store.redis_servers import free_port, single
+from tests.service.tracking.store.stores import scene_name
 from tests.service.processes import process, ready
 from tests.service.servers import running
 from tests.service.tracks import (

@@ -10,7 +10,7 @@ from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from service.api.rest.comments import comments
 from service.predict.options import MAX_POSITION, MAX_TIME
-from service.history.store import WINDOW
+from service.tracking.store.base import WINDOW
 from service.limits import MAX_ID_LENGTH
 from service.settings import Settings
 

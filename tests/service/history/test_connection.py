@@ -18,8 +18,8 @@ from redis.asyncio.sentinel import SentinelConnectionPool
 from service.history import cluster
 from service.redis_url import Endpoint, Layout, RedisAddress, parse_address
 from service.history.connection import CLIENT_NAME, connect
-from tests.service.history import redis_servers
-from tests.service.history.redis_servers import HOST, Cluster, FaultProxy, Process, Sentinels
+from tests.service.tracking.store import redis_servers
+from tests.service.tracking.store.redis_servers import HOST, Cluster, FaultProxy, Process, Sentinels
 
 LAYOUTS = ("redis_server", "redis_sentinels", "redis_cluster")
 ECHO = "return ARGV[1]"

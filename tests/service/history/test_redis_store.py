@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from redis.exceptions import OutOfMemoryError
 
 from service.history.keys import SceneKeys
-from service.history.records import NEWLY, unpack_instants
+from service.tracking.store.records import NEWLY, unpack_instants
 from service.history.redis_store import MAX_ENTRIES, RedisStore
-from service.history.store import Event, Fate, Recalled, TrackStore
-from tests.service.history.redis_servers import Process, single
-from tests.service.history.sightings import START, sighting, times
-from tests.service.history.stores import memory, opened, scene_name
+from service.tracking.store.base import Event, Fate, Recalled, TrackStore
+from tests.service.tracking.store.redis_servers import Process, single
+from tests.service.tracking.store.sightings import START, sighting, times
+from tests.service.tracking.store.stores import memory, opened, scene_name
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from model.arrays import Floats
 from service.tracking.metrics import figures
 from service.tracking.quantile_sketch import Sketches
 from service.tracking.aggregates import CONVERGENCES, DISPERSIONS, ERRORS, Sums
-from service.history.records import COMPLETE, SETTLED
+from service.tracking.store.records import COMPLETE, SETTLED
 from tests.service.tracking.test_metrics import instants
 
 QUANTILES = (0.0, 0.1, 0.5, 0.9, 0.99, 1.0)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from model.metrics.convergence import RANGES_M, convergence_s, errors_by_age_m
 from model.metrics.dispersion import dispersion
 from service.tracking.metrics import AGES_S, figures
-from service.history.records import AGES, COMPLETE, INSTANT, MODES, NEWLY, SETTLED
+from service.tracking.store.records import AGES, COMPLETE, INSTANT, MODES, NEWLY, SETTLED
 
 
 def instants(count: int, seed: int = 0) -> np.ndarray:

@@ -15,7 +15,7 @@ from service.api.rest.comments import comments, parse_comments
 from service.api.rest.examples import IDS, predict_examples, reset_examples
 from service.api.rest.openapi import openapi_document
 from service.api.rest.schemas import REQUIRED, bounds
-from service.history.store import WINDOW
+from service.tracking.store.base import WINDOW
 from service.settings import Settings
 from tests.service.fakes import FakeForecaster
 from tests.service.servers import running

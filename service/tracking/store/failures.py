@@ -4,7 +4,7 @@ from enum import StrEnum
 
 from redis import exceptions as redis_errors
 
-from service.history.store import StoreError
+from service.tracking.store.base import StoreError
 
 
 class Reason(StrEnum):

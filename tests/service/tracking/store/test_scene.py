@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.history.entry import Entry
-from service.history.records import AGES, COMPLETE, NEWLY, SETTLED, unpack_instants
-from service.history.scene import Outcome, SceneMemory
-from service.history.store import MAX_FORECASTS, MAX_SERIES, SETTLE_AFTER, WINDOW, Fate, Sighting
-from service.history.track import bundle
-from tests.service.history.sightings import SERIES, START, observation, sighting, times, where
+from service.tracking.store.log_entry import Entry
+from service.tracking.store.records import AGES, COMPLETE, NEWLY, SETTLED, unpack_instants
+from service.tracking.store.scene import Outcome, SceneMemory
+from service.tracking.store.base import MAX_FORECASTS, MAX_SERIES, SETTLE_AFTER, WINDOW, Fate, Sighting
+from service.tracking.store.track import bundle
+from tests.service.tracking.store.sightings import SERIES, START, observation, sighting, times, where
 
 
 def replay(scene: SceneMemory, moments: list[float], **options: object) -> list[Outcome]:

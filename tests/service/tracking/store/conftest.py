@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.service.history import redis_servers
-from tests.service.history.redis_servers import Cluster, FaultProxy, Process, Sentinels
+from tests.service.tracking.store import redis_servers
+from tests.service.tracking.store.redis_servers import Cluster, FaultProxy, Process, Sentinels
 
 
 @pytest.fixture(scope="session")

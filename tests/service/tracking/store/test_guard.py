@@ -12,9 +12,9 @@ from redis import exceptions as redis_errors
 
 from service.redis_url import parse_address
 from service.history.connection import connect
-from service.history.guard import Guard
-from service.history.store import StoreError
-from tests.service.history.redis_servers import FaultProxy
+from service.tracking.store.guard import Guard
+from service.tracking.store.base import StoreError
+from tests.service.tracking.store.redis_servers import FaultProxy
 
 LONG = 30.0
 """s; a budget that is never used up."""

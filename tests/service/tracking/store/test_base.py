@@ -5,10 +5,10 @@ from collections.abc import AsyncIterator, Sequence
 
 import pytest
 
-from service.history.records import COMPLETE, NEWLY, SETTLED, unpack_instants
-from service.history.store import Event, Fate, Recalled, Sighting, TrackStore
-from tests.service.history.sightings import SERIES, observation, sighting, times, where
-from tests.service.history.stores import memory, opened, scene_name
+from service.tracking.store.records import COMPLETE, NEWLY, SETTLED, unpack_instants
+from service.tracking.store.base import Event, Fate, Recalled, Sighting, TrackStore
+from tests.service.tracking.store.sightings import SERIES, observation, sighting, times, where
+from tests.service.tracking.store.stores import memory, opened, scene_name
 
 
 @pytest.fixture(params=["memory", "redis", "cluster"])

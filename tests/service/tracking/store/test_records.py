@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from model.mixture import TrajectoryMixture
 from model.scenes.observations import Observations
-from service.history.records import (
+from service.tracking.store.records import (
     BLOCK,
     FORECAST_BYTES,
     INSTANT,

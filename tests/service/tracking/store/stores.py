@@ -6,9 +6,9 @@ from contextlib import asynccontextmanager
 
 from service.redis_url import parse_address
 from service.history.connection import connect
-from service.history.memory import MemoryStore
+from service.tracking.store.memory import MemoryStore
 from service.history.redis_store import RedisStore
-from service.history.store import TrackStore
+from service.tracking.store.base import TrackStore
 
 EXPIRY = 30.0
 MAX_AGENTS = 10_000

@@ -1,8 +1,8 @@
 """The track memory that the settings ask for."""
 
 from service.redis_url import parse_address
-from service.history.memory import MemoryStore
-from service.history.store import TrackStore
+from service.tracking.store.memory import MemoryStore
+from service.tracking.store.base import TrackStore
 from service.settings import Settings
 
 MAX_WATCHERS = 64

@@ -6,8 +6,8 @@ from typing import Any
 
 import msgpack
 
-from service.history.records import AGES, FORECAST_BYTES, KINDS, OBSERVATION_BYTES
-from service.history.store import Sighting
+from service.tracking.store.records import AGES, FORECAST_BYTES, KINDS, OBSERVATION_BYTES
+from service.tracking.store.base import Sighting
 
 _VERSION = 1
 """Of this layout. Servers leave out what is of another one."""

@@ -4,7 +4,7 @@ import struct
 
 from model.scenes.observations import JUMP_SLACK, MAX_SPEED
 from model.scenes.resample import TIME_TOLERANCE
-from service.history.records import OBSERVATION_BYTES
+from service.tracking.store.records import OBSERVATION_BYTES
 
 SAME_PLACE = 0.1
 """m; two observations of one time that are farther apart contradict each other."""

@@ -2,7 +2,7 @@
 
 import pytest
 
-from service.history.circuit import Circuit
+from service.tracking.store.circuit_breaker import Circuit
 
 
 class Clock:
