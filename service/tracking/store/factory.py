@@ -16,8 +16,8 @@ def make_store(settings: Settings) -> TrackStore:
     if settings.store == "memory":
         return MemoryStore(settings.track_expiry, settings.max_tracked_agents)
     # Not loaded where it is not used
-    from service.history.connection import connect  # noqa: PLC0415
-    from service.history.redis_store import RedisStore  # noqa: PLC0415
+    from service.tracking.store.redis.connection import connect  # noqa: PLC0415
+    from service.tracking.store.redis.store import RedisStore  # noqa: PLC0415
 
     address = parse_address(settings.store)
     client = connect(

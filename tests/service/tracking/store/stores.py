@@ -5,9 +5,9 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 from service.redis_url import parse_address
-from service.history.connection import connect
+from service.tracking.store.redis.connection import connect
 from service.tracking.store.memory import MemoryStore
-from service.history.redis_store import RedisStore
+from service.tracking.store.redis.store import RedisStore
 from service.tracking.store.base import TrackStore
 
 EXPIRY = 30.0

@@ -11,7 +11,7 @@ import pytest
 from redis import exceptions as redis_errors
 
 from service.redis_url import parse_address
-from service.history.connection import connect
+from service.tracking.store.redis.connection import connect
 from service.tracking.store.guard import Guard
 from service.tracking.store.base import StoreError
 from tests.service.tracking.store.redis_servers import FaultProxy

@@ -9,9 +9,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from redis.exceptions import OutOfMemoryError
 
-from service.history.keys import SceneKeys
+from service.tracking.store.redis.keys import SceneKeys
 from service.tracking.store.records import NEWLY, unpack_instants
-from service.history.redis_store import MAX_ENTRIES, RedisStore
+from service.tracking.store.redis.store import MAX_ENTRIES, RedisStore
 from service.tracking.store.base import Event, Fate, Recalled, TrackStore
 from tests.service.tracking.store.redis_servers import Process, single
 from tests.service.tracking.store.sightings import START, sighting, times

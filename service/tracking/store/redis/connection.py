@@ -15,7 +15,7 @@ from redis.asyncio.sentinel import Sentinel, SentinelConnectionPool
 from redis.backoff import NoBackoff
 
 from service.redis_url import Layout, RedisAddress
-from service.history.cluster import Cluster
+from service.tracking.store.redis.cluster import Cluster
 
 CLIENT_NAME = "cab-forecast"
 """What CLIENT LIST on the server calls us."""
