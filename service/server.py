@@ -10,9 +10,9 @@ import structlog
 
 from model.checkpoint import CheckpointError
 from model.registry import DuplicateModelError, Registry
-from service.api.grpc.server import GrpcServer
-from service.api.rest.app import build_app
-from service.api.rest.server import HttpServer
+from service.transports.grpc.server import GrpcServer
+from service.transports.rest.app import build_app
+from service.transports.rest.server import HttpServer
 from service.predict.catalog import Models
 from service.predict.pipeline import DataPlane
 from service.settings import Settings, SettingsError, bundled_models

@@ -10,10 +10,10 @@ import structlog
 from google.protobuf.message import Message
 from grpc import aio
 
-from service.api.boundary import to_service_error
-from service.api.grpc.status import abort
-from service.api.messages import parse_message
-from service.api.watching import closing
+from service.transports.boundary import to_service_error
+from service.transports.grpc.status import abort
+from service.transports.messages import parse_message
+from service.transports.watching import closing
 from service.errors import TooLarge
 from service.settings import Settings
 from service.telemetry.metrics import Metrics

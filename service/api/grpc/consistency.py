@@ -5,7 +5,7 @@ from collections.abc import AsyncIterator
 import grpc
 
 from cab.forecast.v1 import consistency_service_pb2 as pb
-from service.api.grpc.calls import Calls
+from service.transports.grpc.calls import Calls
 from service.predict.pipeline import DataPlane
 
 CONSISTENCY_SERVICE = pb.DESCRIPTOR.services_by_name["ConsistencyService"].full_name

@@ -8,8 +8,8 @@ from google.protobuf.message import Message
 
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
-from service.api.grpc.calls import Calls, Context
-from service.api.grpc.consistency import CONSISTENCY_SERVICE, ConsistencyHandlers
+from service.transports.grpc.calls import Calls, Context
+from service.transports.grpc.consistency import CONSISTENCY_SERVICE, ConsistencyHandlers
 from service.predict.pipeline import DataPlane
 from service.predict.request_decoder import LARGE_BYTES, Encoded
 from service.predict.request_limits import Sizes

@@ -5,8 +5,8 @@ from typing import Any
 
 import grpc
 
-from service.api.auth import Tokens
-from service.api.grpc.status import abort
+from service.transports.auth import Tokens
+from service.transports.grpc.status import abort
 from service.errors import Unauthenticated
 from service.telemetry.metrics import Metrics
 

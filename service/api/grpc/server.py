@@ -4,10 +4,10 @@ from grpc import aio
 from grpc_health.v1 import health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
-from service.api.auth import Tokens
-from service.api.grpc.handlers import SERVICES, Handlers
-from service.api.grpc.health import HEALTH_SERVICE, Health
-from service.api.grpc.interceptor import AuthInterceptor
+from service.transports.auth import Tokens
+from service.transports.grpc.handlers import SERVICES, Handlers
+from service.transports.grpc.health import HEALTH_SERVICE, Health
+from service.transports.grpc.interceptor import AuthInterceptor
 from service.predict.pipeline import DataPlane
 from service.settings import Settings
 from service.telemetry.metrics import Metrics

@@ -10,13 +10,13 @@ from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 
-from service.api.boundary import to_service_error
-from service.api.rest.calls import Calls
-from service.api.rest.consistency import ConsistencyEndpoints
-from service.api.rest.endpoints import Endpoints
-from service.api.rest.openapi import openapi_document
-from service.api.rest.problem import problem_response
-from service.api.rest.sending import HoldUntilSent
+from service.transports.boundary import to_service_error
+from service.transports.rest.calls import Calls
+from service.transports.rest.consistency import ConsistencyEndpoints
+from service.transports.rest.endpoints import Endpoints
+from service.transports.rest.openapi import openapi_document
+from service.transports.rest.problem import problem_response
+from service.transports.rest.sending import HoldUntilSent
 from service.predict.pipeline import DataPlane, Phase
 from service.errors import BadField, MethodNotAllowed, NotFound, ServiceError, Unavailable
 from service.settings import Settings

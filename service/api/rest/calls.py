@@ -11,11 +11,11 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.types import Receive
 
-from service.api.auth import Tokens
-from service.api.boundary import to_service_error
-from service.api.rest.codec import to_json
-from service.api.rest.negotiation import Format
-from service.api.rest.problem import problem_response
+from service.transports.auth import Tokens
+from service.transports.boundary import to_service_error
+from service.transports.rest.codec import to_json
+from service.transports.rest.negotiation import Format
+from service.transports.rest.problem import problem_response
 from service.errors import ServiceError, TooLarge
 from service.settings import Settings
 from service.telemetry.metrics import Call, Metrics

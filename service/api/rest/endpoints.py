@@ -7,10 +7,10 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from cab.forecast.v1 import model_service_pb2 as models_pb
-from service.api.rest import requests
-from service.api.rest.calls import Calls, respond, unless_disconnected
-from service.api.rest.negotiation import Format, answer_format, request_format, timeout
-from service.api.rest.sending import held
+from service.transports.rest import requests
+from service.transports.rest.calls import Calls, respond, unless_disconnected
+from service.transports.rest.negotiation import Format, answer_format, request_format, timeout
+from service.transports.rest.sending import held
 from service.predict import protobuf_request
 from service.predict.pipeline import DataPlane
 from service.predict.request_decoder import LARGE_BYTES, Encoded

@@ -10,11 +10,11 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.types import Receive, Scope, Send
 
-from service.api.rest.calls import Calls, Counted, unless_disconnected
-from service.api.rest.codec import to_json
-from service.api.rest.negotiation import EVENTS, check_events_accepted, timeout
-from service.api.rest.problem import problem_response, to_problem
-from service.api.watching import paced
+from service.transports.rest.calls import Calls, Counted, unless_disconnected
+from service.transports.rest.codec import to_json
+from service.transports.rest.negotiation import EVENTS, check_events_accepted, timeout
+from service.transports.rest.problem import problem_response, to_problem
+from service.transports.watching import paced
 
 HEARTBEAT = 15.0
 """s without an event after which a comment tells the client, and what is between, that this goes on."""

@@ -5,7 +5,7 @@ from typing import Any
 from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from model.scenes.scene import STEP_SECONDS
-from service.api.rest.codec import to_json
+from service.transports.rest.codec import to_json
 
 _NOW = 1_700_000_000.0
 _FRAMES = 9

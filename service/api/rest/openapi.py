@@ -6,8 +6,8 @@ from typing import Any
 from google.protobuf.descriptor import Descriptor
 
 from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
-from service.api.rest.examples import IDS, events_example, predict_examples, reset_examples
-from service.api.rest.operations import (
+from service.transports.rest.examples import IDS, events_example, predict_examples, reset_examples
+from service.transports.rest.operations import (
     body_of,
     events_operation,
     operation,
@@ -15,7 +15,7 @@ from service.api.rest.operations import (
     problem_schema,
     timeout_parameter,
 )
-from service.api.rest.schemas import Schema, message_schemas, query_parameters
+from service.transports.rest.schemas import Schema, message_schemas, query_parameters
 from service.errors import (
     BadFields,
     DeadlineExceeded,

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from typing import Any
 
-from service.api.rest import problem
-from service.api.rest.comments import comments
-from service.api.rest.negotiation import EVENTS, TIMEOUT_HEADER, Format
-from service.api.rest.schemas import Schema, reference
+from service.transports.rest import problem
+from service.transports.rest.comments import comments
+from service.transports.rest.negotiation import EVENTS, TIMEOUT_HEADER, Format
+from service.transports.rest.schemas import Schema, reference
 from service.errors import (
     Internal,
     NotAcceptable,

@@ -5,7 +5,7 @@ from typing import TypeVar
 from google.protobuf.message import Message
 from starlette.datastructures import QueryParams
 
-from service.api.rest.codec import from_document
+from service.transports.rest.codec import from_document
 from service.errors import BadField
 
 _M = TypeVar("_M", bound=Message)

@@ -8,7 +8,7 @@ call each, and the rest of the request goes through ``ParseDict``.
 from typing import Any
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
-from service.api.rest.codec import from_document, load_document
+from service.transports.rest.codec import from_document, load_document
 from service.predict.request_limits import Sizes
 from service.errors import TooLarge
 

@@ -15,7 +15,7 @@ from hypothesis import given
 
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
-from service.api.rest.codec import parse_json, to_dict, to_json
+from service.transports.rest.codec import parse_json, to_dict, to_json
 from service.errors import BadField
 
 MESSAGES: list[type[Message]] = [

@@ -3,7 +3,7 @@
 import pytest
 from starlette.datastructures import Headers
 
-from service.api.rest.negotiation import (
+from service.transports.rest.negotiation import (
     Format,
     answer_format,
     check_events_accepted,

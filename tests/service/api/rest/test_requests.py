@@ -12,8 +12,8 @@ from google.protobuf import json_format
 from hypothesis import given
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
-from service.api.rest.codec import parse_json
-from service.api.rest.requests import read_request
+from service.transports.rest.codec import parse_json
+from service.transports.rest.requests import read_request
 from service.predict.request_limits import Sizes
 from service.errors import BadField, TooLarge
 from service.settings import Settings

@@ -6,7 +6,7 @@ from contextlib import aclosing
 
 import pytest
 
-from service.api.watching import paced
+from service.transports.watching import paced
 
 
 class Source:
