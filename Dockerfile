@@ -5,6 +5,7 @@ COPY pyproject.toml constraints.txt README.md LICENSE ./
 COPY proto proto
 COPY model model
 COPY service service
+COPY cli cli
 COPY cab_forecast cab_forecast
 COPY benchmark benchmark
 # The CPU build of torch: the default one brings gigabytes of CUDA

@@ -73,10 +73,10 @@ def benchmark(
     from benchmark import BenchmarkError  # noqa: PLC0415 (torch is slow to import)
     from benchmark.run import Benchmark  # noqa: PLC0415
     from benchmark.score import Judging  # noqa: PLC0415
+    from cli.benchmarking import Asking, show_benchmark  # noqa: PLC0415
     from model.data.scenes import DataError  # noqa: PLC0415
     from model.data.sources import READERS, parse_data, parse_protocol  # noqa: PLC0415
     from model.metrics.density import DRAWS  # noqa: PLC0415
-    from cli.benchmarking import Asking, show_benchmark  # noqa: PLC0415
 
     names = [name.strip() for name in (models or "").split(",") if name.strip()]
     if models is not None and not names:

@@ -34,8 +34,8 @@ from benchmark.submission import submission_entries, write_submission
 from benchmark.tables import left_out, markdown, tables
 from cab.forecast.v1.model_service_pb2 import Model
 from cab_forecast import AsyncClient
-from model.arrays import Floats
 from cli.tables import show_tables
+from model.arrays import Floats
 
 TABLES_FILE = "tables.md"
 DRAWN = ("cab", "trajectron")

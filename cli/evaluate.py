@@ -39,14 +39,14 @@ def evaluate(
     ] = None,
 ) -> None:
     """Judges checkpoints beside physics and Kalman on every challenge pair of a split, without a server."""
+    from cli.evaluation import show_evaluation  # noqa: PLC0415
+    from cli.tables import show_tables  # noqa: PLC0415
     from model.checkpoint import CheckpointError  # noqa: PLC0415 (torch is slow to import)
     from model.data.scenes import DataError  # noqa: PLC0415
     from model.data.sources import READERS, parse_data, parse_protocol  # noqa: PLC0415
     from model.evaluation.run import Evaluation, write_results  # noqa: PLC0415
     from model.evaluation.subjects import EvaluationError, choose  # noqa: PLC0415
     from model.evaluation.tables import tables  # noqa: PLC0415
-    from cli.evaluation import show_evaluation  # noqa: PLC0415
-    from cli.tables import show_tables  # noqa: PLC0415
     from service.settings import bundled_models  # noqa: PLC0415
 
     names = [name.strip() for name in (only or "").split(",") if name.strip()]

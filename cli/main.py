@@ -5,13 +5,7 @@ from typing import Annotated
 
 import typer
 
-from cli import benchmark
-from cli import consistency
-from cli import convert
-from cli import evaluate
-from cli import predict
-from cli import serve
-from cli import train
+from cli import benchmark, consistency, convert, evaluate, predict, serve, train
 
 app = typer.Typer(
     name="cab-forecast",

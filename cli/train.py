@@ -51,13 +51,13 @@ def register(app: typer.Typer) -> None:
         ] = None,
     ) -> None:
         """Trains a method and writes its best epoch as a checkpoint that serve loads."""
+        from cli.training import show_training  # noqa: PLC0415
         from model.checkpoint import CheckpointError, load_checkpoint  # noqa: PLC0415 (torch is slow to import)
         from model.data.scenes import DataError  # noqa: PLC0415
         from model.data.sources import parse_also, parse_data, parse_protocol  # noqa: PLC0415
         from model.forecaster import Protocol  # noqa: PLC0415
         from model.training.config import TrainingError, load_config, parse_method  # noqa: PLC0415
         from model.training.run import Run, Source  # noqa: PLC0415
-        from cli.training import show_training  # noqa: PLC0415
 
         changes: dict[str, object] = {"epochs": epochs, "learning_rate": learning_rate, "seed": seed}
         changes["cooldown_epochs"] = cooldown_epochs

@@ -16,10 +16,9 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError, mod
 from safetensors import SafetensorError
 from torch import Tensor
 
-from model.covernet import CoverNetForecaster
-from model.networks.cvae import CvaeForecaster
 from model.forecaster import Forecaster, ModelInfo
 from model.networks.config import AnyNetworkConfig, CoverNetConfig
+from model.networks.forecaster import CoverNetForecaster, CvaeForecaster
 
 FORMAT_VERSION = 1
 """Of the folder's layout and of config.json; what reads one version reads no other."""

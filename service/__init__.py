@@ -1,1 +1,1 @@
-"""The forecasting server: one transport-neutral core, REST and gRPC thin on top of it."""
+"""The forecasting server: transports call predict, predict calls tracking."""

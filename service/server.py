@@ -10,13 +10,13 @@ import structlog
 
 from model.checkpoint import CheckpointError
 from model.registry import DuplicateModelError, Registry
-from service.transports.grpc.server import GrpcServer
-from service.transports.rest.app import build_app
-from service.transports.rest.server import HttpServer
 from service.predict.catalog import Models
 from service.predict.pipeline import DataPlane
 from service.settings import Settings, SettingsError, bundled_models
 from service.telemetry.metrics import Metrics
+from service.transports.grpc.server import GrpcServer
+from service.transports.rest.app import build_app
+from service.transports.rest.server import HttpServer
 
 _log = structlog.get_logger(__name__)
 

@@ -1,0 +1,1 @@
+"""Physics and Kalman baselines, and the uncertainty that they state."""

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from model.arrays import Ints
+from model.baselines.unimodal import require_observed, single_mode, step_times
 from model.forecaster import Context, Features, Forecaster, ModelInfo, Protocol
 from model.mixture import TrajectoryMixture
 from model.scenes.scene import STEP_SECONDS, AgentType, Scene
-from model.baselines.unimodal import require_observed, single_mode, step_times
 
 HISTORY_FRAMES = 5
 """Frames that the filter runs over: 2 s, the history of nuScenes' challenge."""
@@ -59,8 +59,8 @@ NOISE: Mapping[AgentType, Noise] = {
     AgentType.UNKNOWN: _ANY_SPEED,
 }
 """Density and measurement noise: fitted for vehicles and pedestrians to the data that
-``model.baselines.uncertainty`` names, by minimising the same likelihood of the forecast positions at 0.5, 1, … 6 s.
-The velocity's and all of cyclists and unknown agents are assumptions.
+``model.baselines.uncertainty`` names, by minimising the same likelihood of the forecast positions at 0.5, 1,
+… 6 s. The velocity's and all of cyclists and unknown agents are assumptions.
 
 The density of standing vehicles is the likeliest of nine tried on those of v1.0-mini: 0.003 up to 0.1 m/s,
 0.01 up to 0.3 m/s. With that of moving ones a parked car's σ would be 8.8 m at 6 s instead of 0.9 m; 99 %

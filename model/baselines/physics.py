@@ -13,13 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.baselines import uncertainty
 from model.arrays import Ints
+from model.baselines import uncertainty
+from model.baselines.uncertainty import SpreadBySpeed, aligned_covariance
+from model.baselines.unimodal import require_observed, single_mode, step_times
 from model.forecaster import Context, Features, Forecaster, ModelInfo, Protocol
 from model.mixture import TrajectoryMixture
 from model.scenes.scene import AgentType, Scene
-from model.baselines.unimodal import require_observed, single_mode, step_times
-from model.baselines.uncertainty import SpreadBySpeed, aligned_covariance
 
 STANDING_SPEED = 1e-6
 """m/s; up to it the velocity has no direction, and the agent would set off along its heading."""

@@ -11,9 +11,9 @@ from model.checkpoint import save_checkpoint
 from model.convert.errors import ConversionError
 from model.convert.legacy import read_parameters
 from model.convert.names import rename
-from model.networks.cvae import CvaeForecaster
 from model.forecaster import ModelInfo, Protocol
 from model.networks.config import BlindContext, NetworkConfig
+from model.networks.forecaster import CvaeForecaster
 from model.scenes.scene import AgentType
 
 _REQUIRED: Final[dict[str, Any]] = {

@@ -1,4 +1,4 @@
-"""Batches of a cache's pairs on a device, as ``model.features.inputs`` would make them."""
+"""Batches of a cache's pairs on a device, as ``model.features.scene_features`` would make them."""
 
 from collections.abc import Sequence
 
@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 
 from model.arrays import Bools
+from model.data.augmentation import rotate
 from model.data.cache import Cache
 from model.data.cache_layout import draws, in_agent_frame, neighbors_name
 from model.data.packing import unpack_patches
 from model.data.patches import PatchCutter
-from model.data.augmentation import rotate
 from model.data.scenes import DataError
 from model.forecaster import Features
 from model.geometry import rotate as rotate_vectors
@@ -125,8 +125,9 @@ class Batches:
             indices: [n] int64, on any device.
 
         Returns:
-            The features of ``model.features.inputs.network_features`` with full context, patches included, and the
-            future [n, 12, 2] float32, m, relative to the position now, ground frame; on the device.
+            The features of ``model.features.scene_features.network_features`` with full context, patches
+            included, and the future [n, 12, 2] float32, m, relative to the position now, ground frame; on the
+            device.
         """
         indices = indices.to(self._device)
         features = {name: array.index_select(0, indices) for name, array in self._arrays.items()}

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from model.features.agent_features import HISTORY_SCALE, agent_frame_features
 from model.arrays import Bytes, Float32s, Floats, Ints
 from model.data.cache_layout import (
     FORMAT_VERSION,
@@ -36,13 +35,14 @@ from model.data.packing import pack, pack_patches, unpack
 from model.data.protocols import SceneFrames
 from model.data.scenes import DataError, Reader, SceneRecord
 from model.data.sensing import SensedFrames
+from model.features.agent_features import HISTORY_SCALE, agent_frame_features
+from model.features.scene_features import network_features
+from model.features.standardization import state_scale
 from model.forecaster import Context, Protocol
 from model.geometry import wrap_angle
-from model.features.inputs import network_features
 from model.networks.config import AnyNetworkConfig, Frame, NetworkConfig
 from model.scenes.raster import FAR, NEAR, cut_patches
 from model.scenes.scene import AgentType, Raster
-from model.features.standardization import state_scale
 
 __all__ = ["Cache", "CacheKey", "build_cache"]
 

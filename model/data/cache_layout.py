@@ -5,15 +5,15 @@ from typing import TypeAlias
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from model.features.agent_features import NEIGHBOR_FEATURES, NEIGHBORS
 from model.data.checks import FUTURE_STEPS
 from model.data.scenes import Reader
+from model.features.agent_features import NEIGHBOR_FEATURES, NEIGHBORS
+from model.features.neighbor_boxes import BOX_NUMBERS, BOXES
+from model.features.standardization import STATE_SIZE
 from model.forecaster import Protocol
 from model.networks.config import AnyNetworkConfig, CoverNetConfig, Frame, NetworkConfig
 from model.scenes.raster import PATCH_SIZE
 from model.scenes.scene import AgentType
-from model.features.standardization import STATE_SIZE
-from model.features.neighbor_boxes import BOX_NUMBERS, BOXES
 
 FORMAT_VERSION = 3
 """Version of the folder's layout and of how its arrays are derived from the data: whoever changes either

@@ -41,7 +41,8 @@ def check_pairs(where: str, tracks: Sequence[Track], pairs: Sequence[Pair]) -> N
 
 
 def check_raster(where: str, raster: Raster) -> None:
-    """The raster is one that patches are cut from as it is: ``model.scenes.raster`` first coarsens finer ones.
+    """The raster is one that patches are cut from as it is: ``model.scenes.raster`` first coarsens finer
+    ones.
 
     Args:
         where: the file (or scene) to name.

@@ -23,7 +23,8 @@ def hide_context(features: Features) -> Features:
     """Return features in which some agents lack a map, a part of it, or their neighbours.
 
     Args:
-        features: in the agents' frames (``model.features.agent_features``), maps packed (``Batches``); left as they
+        features: in the agents' frames (``model.features.agent_features``), maps packed (``Batches``); left
+            as they
             are.
     """
     hidden = dict(features)

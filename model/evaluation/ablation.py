@@ -30,7 +30,8 @@ def without_map(features: Features) -> Features:
     """The features with the null map.
 
     Args:
-        features: of ``model.features.inputs``; ``map`` and, where there is one, ``far_map`` [N, 3, 100, 100] in
+        features: of ``model.features.scene_features``; ``map`` and, where there is one, ``far_map`` [N, 3,
+            100, 100] in
             [-1, 1].
     """
     return features | {name: torch.zeros_like(features[name]) for name in _MAPS & features.keys()}
@@ -40,7 +41,8 @@ def without_neighbors(features: Features) -> Features:
     """The features of agents that are alone.
 
     Args:
-        features: of ``model.features.inputs``; ``neighbors.<type>`` [N, F, D] and ``edge_mask`` [N], or
+        features: of ``model.features.scene_features``; ``neighbors.<type>`` [N, F, D] and ``edge_mask`` [N],
+            or
             ``neighbors`` [N, M, 11], or ``surroundings`` [N, S, 5].
     """
     gone = [name for name in features if name.partition(".")[0] in _NEIGHBORS]

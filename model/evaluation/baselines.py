@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.baselines import physics
 from model.arrays import Bools, Floats
+from model.baselines import physics
+from model.baselines.kalman import HISTORY_FRAMES
 from model.data.checks import FUTURE_STEPS, STEPS_AHEAD, check_pairs
 from model.data.protocols import SceneFrames
 from model.data.scenes import DataError, Pair, Reader, SceneRecord
 from model.forecaster import Features, Forecaster, Protocol, join
-from model.baselines.kalman import HISTORY_FRAMES
 from model.metrics.aggregate import MetricMeans
 from model.metrics.evaluate import instance_metrics
 from model.metrics.oracle import ORACLE, oracle_figures, oracle_mixture

@@ -4,8 +4,7 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from model.baselines import kalman
-from model.baselines import physics
+from model.baselines import kalman, physics
 from model.checkpoint import Checkpoint
 from model.forecaster import Forecaster, ModelInfo, Protocol
 from model.metrics.oracle import ORACLE

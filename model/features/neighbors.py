@@ -3,9 +3,9 @@
 import numpy as np
 
 from model.arrays import Floats, Ints
+from model.features.standardization import ATTENTION_RADIUS, HEADING, STATE_SIZE, state_scale, state_vectors
 from model.geometry import wrap_angle
 from model.scenes.scene import AgentStates, AgentType
-from model.features.standardization import ATTENTION_RADIUS, HEADING, STATE_SIZE, state_scale, state_vectors
 
 _RAMP = np.array([0.25, 0.5, 0.75, 1.0])
 """Weights of presence now, 0.5 s ago, … 1.5 s ago: an edge fades in (Trajectron++, section 4.1)."""

@@ -4,13 +4,15 @@ import numpy as np
 import torch
 
 from model.arrays import Float32s, Floats, Ints
+from model.features.agent_features import agent_frame_features
+from model.features.neighbor_boxes import surroundings
+from model.features.neighbors import edge_ramps, neighbor_sums
+from model.features.standardization import HEADING, state_scale, state_vectors
 from model.forecaster import Context, Features
 from model.geometry import wrap_angle
-from model.features.neighbors import edge_ramps, neighbor_sums
-from model.networks.config import NetworkConfig
+from model.networks.config import AnyNetworkConfig, Frame, NetworkConfig
 from model.scenes.raster import PATCH_SIZE, cut_patches
 from model.scenes.scene import AgentStates, AgentType, Scene
-from model.features.standardization import HEADING, state_scale, state_vectors
 
 
 def scene_features(
@@ -70,3 +72,25 @@ def _maps(scene: Scene, targets: Ints) -> Float32s:
     for row in np.flatnonzero(own):
         maps[row] = 2 * scene.patches[int(targets[row])].astype(np.float32) - 1
     return maps
+
+
+def network_features(
+    scene: Scene, targets: Ints, agent_type: AgentType, config: AnyNetworkConfig, context: Context
+) -> Features:
+    """Features of n agents of one type.
+
+    Returns:
+        Those of ``model.features.scene_features.scene_features``; for a network of the agent's frame those of
+        ``model.features.agent_features.agent_frame_features``; for CoverNet the former without neighbours'
+        histories, but with ``surroundings`` [n, S, 5] float32 (``model.features.neighbor_boxes``) where it
+        draws any and the context is full.
+    """
+    if isinstance(config, NetworkConfig) and config.frame is Frame.AGENT:
+        return agent_frame_features(scene, targets, config, context)
+    if isinstance(config, NetworkConfig):
+        return scene_features(scene, targets, agent_type, config, context)
+    alone = NetworkConfig(neighbor_types=(), uses_map=config.uses_map)
+    features = scene_features(scene, targets, agent_type, alone, context)
+    if config.neighbor_types and context is Context.FULL:
+        features["surroundings"] = torch.from_numpy(surroundings(scene, targets, config.neighbor_types))
+    return features

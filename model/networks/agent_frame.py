@@ -24,13 +24,13 @@ from model.features.agent_features import (
     NEIGHBOR_POSITION_SCALE,
     NEIGHBOR_VELOCITY_SCALE,
 )
+from model.features.standardization import STATE_SIZE
 from model.forecaster import Context, Features
 from model.networks.config import NetworkConfig
 from model.networks.dynamics import Positions
 from model.networks.recurrent import HistoryLSTM
 from model.scenes.raster import FAR, PatchGeometry
 from model.scenes.scene import STEP_SECONDS, AgentType
-from model.features.standardization import STATE_SIZE
 
 STEPS = 12
 """T, steps of 0.5 s that are decoded."""

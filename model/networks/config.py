@@ -5,8 +5,8 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, NonNegativeFloat, Tag, model_validator
 
-from model.scenes.scene import AgentType
 from model.features.standardization import STATE_SIZE
+from model.scenes.scene import AgentType
 
 HIDDEN = 32
 """Width of every encoder (Trajectron++, appendix)."""

@@ -4,14 +4,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from model.baselines.uncertainty import oriented_covariance
+from model.features.standardization import HEADING, state_scale
 from model.forecaster import Context, Features
 from model.networks.config import CoverNetConfig
-from model.networks.rasterize_boxes import draw_boxes
 from model.networks.dynamics import Positions
 from model.networks.encoders import ConvShape, MapEncoder
+from model.networks.rasterize_boxes import draw_boxes
 from model.scenes.scene import AgentType
-from model.features.standardization import HEADING, state_scale
-from model.baselines.uncertainty import oriented_covariance
 
 _MAP_CHANNELS = 3
 _PIXELS = 64 * 4 * 4

@@ -9,12 +9,15 @@ import torch
 from torch import Tensor, nn
 
 from model.arrays import Ints
-from model.forecaster import Context, Features, Forecaster, ModelInfo
-from model.features.inputs import network_features
-from model.mixture import TrajectoryMixture
-from model.networks.config import AnyNetworkConfig, NetworkConfig
-from model.scenes.scene import AgentType, Scene
 from model.baselines.unimodal import require_observed
+from model.features.scene_features import network_features
+from model.forecaster import Context, Features, Forecaster, ModelInfo
+from model.mixture import TrajectoryMixture
+from model.networks.agent_frame import AgentFrameNetwork
+from model.networks.config import AnyNetworkConfig, CoverNetConfig, Frame, NetworkConfig
+from model.networks.covernet import CoverNet
+from model.networks.network import AgentNetwork
+from model.scenes.scene import AgentType, Scene
 
 SMALLEST_VARIANCE = 1e-6
 """m²; no forecast is surer than that in any direction."""
@@ -127,3 +130,55 @@ def _check(expected: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> None:
             faults.append(f"{name} is {given[name].dtype}, not float32")
     if faults:
         raise ValueError("; ".join(sorted(faults)[:5]) + (" …" if len(faults) > 5 else ""))
+
+
+class CvaeNetworks(Networks[AgentNetwork | AgentFrameNetwork]):
+    """The networks of a CVAE."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        if config.frame is Frame.AGENT:
+            networks: dict[AgentType, AgentNetwork | AgentFrameNetwork] = {
+                AgentType.VEHICLE: AgentFrameNetwork(config)
+            }
+        else:
+            networks = {kind: AgentNetwork(config, kind) for kind in config.agent_types}
+        super().__init__(config, networks)
+
+
+class CvaeForecaster(NetworkForecaster[CvaeNetworks]):
+    """CAB, Trajectron++, Reweight, RUBiZ or HalentNet, depending on the weights.
+
+    Args:
+        info: what is known of the model.
+        config: the networks' shape.
+        tensors: their parameters by name.
+
+    Raises:
+        ValueError: the tensors are not those of such networks, naming them.
+    """
+
+    def __init__(self, info: ModelInfo, config: NetworkConfig, tensors: Mapping[str, Tensor]) -> None:
+        super().__init__(info, lambda: CvaeNetworks(config), tensors)
+
+
+class CoverNetworks(Networks[CoverNet]):
+    """The networks of CoverNet: one, for vehicles."""
+
+    def __init__(self, config: CoverNetConfig) -> None:
+        super().__init__(config, {kind: CoverNet(config) for kind in config.agent_types})
+
+
+class CoverNetForecaster(NetworkForecaster[CoverNetworks]):
+    """CoverNet: the likeliest members of a fixed set of trajectories.
+
+    Args:
+        info: what is known of the model.
+        config: the network's shape.
+        tensors: its parameters and its set of trajectories by name.
+
+    Raises:
+        ValueError: the tensors are not those of such a network, naming them.
+    """
+
+    def __init__(self, info: ModelInfo, config: CoverNetConfig, tensors: Mapping[str, Tensor]) -> None:
+        super().__init__(info, lambda: CoverNetworks(config), tensors)

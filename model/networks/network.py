@@ -4,13 +4,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from model.features.standardization import STATE_SIZE
 from model.forecaster import Context, Features
 from model.networks.config import HIDDEN, BlindContext, NetworkConfig
 from model.networks.decoder import ModeDecoder
 from model.networks.dynamics import Controls, Positions, integrate_unicycle, integrate_velocity
 from model.networks.encoders import FutureEncoder, HistoryEncoder, MapEncoder, NeighborEncoder
 from model.scenes.scene import AgentType
-from model.features.standardization import STATE_SIZE
 
 PRIOR_DROPOUT = 0.1
 

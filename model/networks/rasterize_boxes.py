@@ -5,8 +5,8 @@ import math
 import torch
 from torch import Tensor
 
-from model.scenes.raster import COLUMNS_RIGHT, PATCH_PIXELS_PER_METER, PATCH_SIZE, ROWS_BEHIND
 from model.features.neighbor_boxes import BOX_REACH
+from model.scenes.raster import COLUMNS_RIGHT, PATCH_PIXELS_PER_METER, PATCH_SIZE, ROWS_BEHIND
 
 _RADIUS = math.floor(BOX_REACH * PATCH_PIXELS_PER_METER + math.sqrt(0.5))
 """Pixels from the one that a box's middle lies in: none farther away than that, or one more upwards, is
@@ -14,7 +14,8 @@ touched by the box and its soft edge."""
 
 
 def draw_boxes(boxes: Tensor) -> Tensor:
-    """A picture of boxes in the geometry of the map patch (``model.scenes.raster``): rows ahead, columns left.
+    """A picture of boxes in the geometry of the map patch (``model.scenes.raster``): rows ahead, columns
+    left.
 
     A pixel is as much covered as each side of the box, had it no other, would cover of it: edges are soft
     over one pixel, so that a box moves smoothly. Only the pixels around each box are looked at.

@@ -1,0 +1,1 @@
+"""What was seen: observations, resampling to the grid, rasters and their patches."""

@@ -3,8 +3,8 @@
 Causal: a grid state depends on what was observed up to the present, never on the future (REFERENCE:
 the papers' released preprocessing differentiates centrally over whole tracks; a live service cannot).
 At 2 Hz what an observation gives is used as it is, and what it does not give is derived by backward
-differences. Denser observations are evidence, to which the states are fitted (``model.scenes.fit``); in between,
-from 2.5 to some 4.5 Hz, the one passes over into the other.
+differences. Denser observations are evidence, to which the states are fitted (``model.scenes.fit``); in
+between, from 2.5 to some 4.5 Hz, the one passes over into the other.
 """
 
 from collections.abc import Callable
@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from model.arrays import Bools, Floats, Ints
-from model.scenes.fit import MIN_HEADING_SPEED, Fitted, fit
 from model.geometry import wrap_angle
+from model.scenes.fit import MIN_HEADING_SPEED, Fitted, fit
 from model.scenes.observations import Observations
 from model.scenes.scene import STEP_SECONDS, AgentStates
 
@@ -48,9 +48,9 @@ def resample(observations: Observations, time: float, frames: int) -> AgentState
     replaced by the direction of motion.
 
     Where observations are denser, position, velocity, acceleration, heading and heading rate are those of a
-    fit to the observations within ``model.scenes.fit.WINDOW`` before the grid time and, up to the present, after
-    it. Given velocities, accelerations and heading rates are measurements like others. So is the course over
-    ground, for the heading of what moves; an agent that reverses keeps its headings.
+    fit to the observations within ``model.scenes.fit.WINDOW`` before the grid time and, up to the present,
+    after it. Given velocities, accelerations and heading rates are measurements like others. So is the course
+    over ground, for the heading of what moves; an agent that reverses keeps its headings.
 
     A heading that is not given is the direction of motion from ``MIN_HEADING_SPEED`` on (the opposite one
     for an agent whose given headings show that it reverses), else the last known one.

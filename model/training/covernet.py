@@ -6,14 +6,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from model.covernet import CoverNetworks
 from model.networks.config import CoverNetConfig
 from model.networks.covernet import present_heading, turned
+from model.networks.forecaster import CoverNetworks
 from model.scenes.scene import AgentType
 from model.training.config import TrainingConfig, TrainingError
-from model.training.trajectory_set import make_cover, summed_distances
 from model.training.learner import Batch, DescentLearner
 from model.training.objectives import Weights
+from model.training.trajectory_set import make_cover, summed_distances
 
 _TOP = 5
 

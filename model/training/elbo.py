@@ -10,10 +10,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from model.features.standardization import FUTURE_POSITION_SCALE
 from model.forecaster import Context, Features
 from model.mixture import guarded_log_density
 from model.networks.network import AgentNetwork
-from model.features.standardization import FUTURE_POSITION_SCALE
 
 LEAST_KL = 0.07
 """nats; below it the divergence is not pressed further."""

@@ -11,10 +11,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from model.features.standardization import FUTURE_POSITION_SCALE
 from model.forecaster import Context
 from model.networks.covernet import present_heading, turned
 from model.scenes.scene import AgentType
-from model.features.standardization import FUTURE_POSITION_SCALE
 from model.training.config import TrainingConfig
 from model.training.discriminator import Discriminator, Verdict
 from model.training.learner import Batch, CvaeLearner

@@ -7,16 +7,15 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from model.networks.cvae import CvaeNetworks
 from model.data.hiding import hide_context
 from model.data.holdups import block
 from model.data.jittering import jitter
 from model.data.packing import unpack_patches
 from model.forecaster import Features
-from model.networks.forecaster import Networks
 from model.networks.agent_frame import AgentFrameNetwork
 from model.networks.config import NetworkConfig
 from model.networks.covernet import turned
+from model.networks.forecaster import CvaeNetworks, Networks
 from model.networks.network import AgentNetwork
 from model.scenes.scene import AgentType
 from model.training.config import Method, TrainingConfig

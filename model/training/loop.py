@@ -12,8 +12,8 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
+from model.data.augmentation import mirror
 from model.data.holdups import hold
-from model.data.mirroring import mirror
 from model.networks.forecaster import Networks
 from model.training import processes
 from model.training.annealing import ANNEALED, KL_SHARE, Z_LOGIT_CLIP, cooldown, learning_rate

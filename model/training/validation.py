@@ -15,8 +15,8 @@ from model.metrics.aggregate import MetricMeans
 from model.metrics.evaluate import instance_metrics
 from model.metrics.standing import stood
 from model.mixture import TrajectoryMixture
-from model.networks.forecaster import Networks
 from model.networks.config import AnyNetworkConfig
+from model.networks.forecaster import Networks
 from model.scenes.scene import AgentType, Raster
 
 BATCH = 512

@@ -1,0 +1,1 @@
+"""One Predict call: decode, validate, recall, plan, batch, encode, remember."""

@@ -20,10 +20,10 @@ from model.arrays import Bools, Bytes, Float32s, Floats, Ints
 from model.scenes.observations import JUMP_SLACK, MAX_SPEED, Observations
 from model.scenes.resample import MAX_AGE, TIME_TOLERANCE
 from model.scenes.scene import AgentType
-from service.predict.images import decode_layers
-from service.predict.options import MAX_POSITION, MAX_TIME
 from service.errors import BadField, Fault
 from service.limits import too_long
+from service.predict.images import decode_layers
+from service.predict.options import MAX_POSITION, MAX_TIME
 from service.settings import Settings
 
 PATCH_PIXELS = 100

@@ -20,8 +20,8 @@ import torch
 from model.forecaster import Context, Features, Forecaster, agent_count, join
 from model.mixture import TrajectoryMixture
 from model.scenes.scene import AgentType
-from service.predict.torch_threads import set_forward_threads
 from service.errors import DeadlineExceeded, Internal, Overloaded, Unavailable
+from service.predict.torch_threads import set_forward_threads
 from service.telemetry.metrics import Metrics
 
 _log = structlog.get_logger(__name__)

@@ -7,8 +7,8 @@ from PIL import Image
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.arrays import Bytes
-from service.predict.png import PngError, pixels_only, read_header
 from service.errors import BadField
+from service.predict.png import PngError, pixels_only, read_header
 
 LAYERS = 3
 _RGB_8 = (8, 2)  # bit depth, colour type

@@ -8,9 +8,9 @@ import numpy as np
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.forecaster import Context, ModelInfo
 from model.scenes.scene import STEP_SECONDS, Raster
-from service.predict.images import decode_layers
 from service.errors import BadField, TooLarge
 from service.limits import too_long
+from service.predict.images import decode_layers
 from service.settings import Settings
 
 MAX_TIME = 1e10

@@ -20,26 +20,26 @@ from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.forecaster import Forecaster
 from model.scenes.resample import history_seconds
-from service.tracking.service import ConsistencyPlane
-from service.tracking.tracker import Tracked, Tracker
+from service.errors import BadField, DeadlineExceeded, Fault, Unavailable, UnknownModel
 from service.predict.agents import Agents, read_agents
 from service.predict.batcher import Admission, Batcher, Outcome
 from service.predict.catalog import Catalog, Models, build_catalog, reference
 from service.predict.encode import Result, encode, finite
-from service.predict.request_decoder import Encoded, Reader
+from service.predict.off_road import count_off_road
 from service.predict.options import Options, read_options
 from service.predict.plan import Draft, Group, Plan, check_strict, fall_back, frames_of, make_plan
-from service.predict.off_road import count_off_road
+from service.predict.request_decoder import Encoded, Reader
 from service.predict.torch_threads import set_helper_threads
 from service.predict.track_updates import observed, report, sightings, with_histories
 from service.predict.warmup import warm_up
-from service.errors import BadField, DeadlineExceeded, Fault, Unavailable, UnknownModel
-from service.tracking.store.guard import Guard
+from service.settings import Settings
+from service.telemetry.metrics import Metrics
+from service.tracking.collector import ConsistencyCollector, StoreMetrics
+from service.tracking.service import ConsistencyPlane
 from service.tracking.store.base import Sighting
 from service.tracking.store.factory import make_store
-from service.settings import Settings
-from service.tracking.collector import ConsistencyCollector, StoreMetrics
-from service.telemetry.metrics import Metrics
+from service.tracking.store.guard import Guard
+from service.tracking.tracker import Tracked, Tracker
 
 _log = structlog.get_logger(__name__)
 

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from google.protobuf.message import DecodeError
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
-from service.predict.request_limits import Sizes
 from service.errors import BadField, TooLarge
+from service.predict.request_limits import Sizes
 
 _AGENTS = pb.PredictRequest.AGENTS_FIELD_NUMBER
 _STATES = pb.Agent.STATES_FIELD_NUMBER

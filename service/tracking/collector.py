@@ -9,8 +9,8 @@ from prometheus_client.registry import Collector
 
 from model.arrays import Floats
 from model.metrics.convergence import RANGES_M
-from service.tracking.metrics import AGES_S
 from service.tracking.aggregates import CONVERGENCES, DISPERSIONS, ERRORS, ModelSums, Sums
+from service.tracking.metrics import AGES_S
 
 _STORE_SECONDS = (0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 _METERS = np.array([0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 3.0, 5.0, 7.0, 10.0, 15.0, 20.0, 30.0, 50.0])

@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from cab.forecast.v1 import consistency_service_pb2 as pb
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from model.metrics.convergence import RANGES_M
+from service.tracking.aggregates import CONVERGENCES, DISPERSIONS, ERRORS, ModelSums, Sums
 from service.tracking.metrics import AGES_S, Figures
 from service.tracking.quantile_sketch import Spread
-from service.tracking.aggregates import CONVERGENCES, DISPERSIONS, ERRORS, ModelSums, Sums
 
 ReferenceOf = Callable[[str], models_pb.ModelReference]
 """The model that name@version names."""

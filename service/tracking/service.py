@@ -4,15 +4,15 @@ import asyncio
 from collections.abc import AsyncIterator, Callable, Sequence
 
 from cab.forecast.v1 import consistency_service_pb2 as pb
-from service.tracking.metrics import Figures, figures
-from service.tracking.messages import ReferenceOf, instant_messages, model_messages
-from service.tracking.aggregates import Sums
-from service.tracking.tracker import PATIENCE
 from service.errors import BadField, Overloaded, TrackingUnavailable, UnknownTrack
-from service.tracking.store.guard import Guard
+from service.limits import too_long
+from service.tracking.aggregates import Sums
+from service.tracking.messages import ReferenceOf, instant_messages, model_messages
+from service.tracking.metrics import Figures, figures
 from service.tracking.store.base import WINDOW, Remembered, StoreError, TrackStore
 from service.tracking.store.factory import MAX_WATCHERS
-from service.limits import too_long
+from service.tracking.store.guard import Guard
+from service.tracking.tracker import PATIENCE
 
 DEFAULT_WINDOW = 2.0
 """s back from an agent's newest observation."""

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from time import perf_counter
 
 from cab.forecast.v1 import consistency_service_pb2 as pb
-from service.tracking.metrics import figures
-from service.tracking.messages import ReferenceOf, instant_messages
-from service.tracking.statuses import OF_AGENT, OF_SCENE
 from service.tracking.aggregates import Sums
-from service.tracking.store.guard import Guard
+from service.tracking.messages import ReferenceOf, instant_messages
+from service.tracking.metrics import figures
+from service.tracking.statuses import OF_AGENT, OF_SCENE
 from service.tracking.store.base import Recalled, Sighting, StoreError, TrackStore
+from service.tracking.store.guard import Guard
 
 PATIENCE = 2.0
 """s that those who do not forecast wait for the track memory."""

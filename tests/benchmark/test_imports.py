@@ -6,8 +6,8 @@ import sys
 MODULES = ("run", "judge", "submission", "tables", "compare", "report.page")
 FORBIDDEN = (
     "model.networks",
-    "model.networks.cvae",
-    "model.covernet",
+    "model.networks.forecaster",
+    "model.networks.forecaster",
     "model.registry",
     "model.checkpoint",
     "service",

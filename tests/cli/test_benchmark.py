@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 
 from benchmark.archive import FILE
 from benchmark.rules import RULES_FILE
-from model.data.sources import READERS, parse_data
 from cli.main import app
+from model.data.sources import READERS, parse_data
 from service.server import Server
 from tests.benchmark.scenes import PAIRS, READER, RECORDS, write_nuscenes_pred
 from tests.model.evaluation.builders import checkpoints

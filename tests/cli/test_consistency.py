@@ -17,8 +17,8 @@ from pydantic import SecretStr
 from typer.testing import CliRunner
 
 from cab.forecast.v1 import consistency_service_pb2 as pb
-from service import errors
 from cli.main import app
+from service import errors
 from service.server import Server
 from tests.cab_forecast.fakes import free_port
 from tests.service.planes import AGENT, EVENT, MODELS, RESET, SCENE, FakePlane, with_fake_plane

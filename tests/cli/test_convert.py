@@ -6,9 +6,9 @@ import pytest
 from typer.testing import CliRunner
 
 import model.convert
+from cli.main import app
 from model.checkpoint import CheckpointError
 from model.convert import UnsafePickleError
-from cli.main import app
 
 
 def run(*arguments: str) -> tuple[int, str, str]:

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from model.data.sources import READERS
 from cli.main import app
+from model.data.sources import READERS
 from tests.model.data.records import FixedReader, record
 from tests.model.evaluation.builders import PAPER_VERSION, checkpoints, save
 

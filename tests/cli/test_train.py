@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from cli.main import app
 from model.checkpoint import load_checkpoint
 from model.data.sources import READERS
 from model.training.config import Method
-from cli.main import app
 from tests.model.data.records import FixedReader, record
 from tests.model.training.fakes import small_config
 

@@ -9,12 +9,12 @@ from prometheus_client.parser import text_string_to_metric_families
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from cab_forecast import scene_raster
 from service import errors
-from service.tracking.store.failures import Reason
 from service.server import Server
+from service.tracking.store.failures import Reason
 from tests.service.fakes import FakeForecaster
-from tests.service.tracking.store.stores import scene_name
 from tests.service.requests import make_request
 from tests.service.servers import call_grpc, call_rest, running
+from tests.service.tracking.store.stores import scene_name
 from tests.service.tracks import made_up
 
 Labels = dict[str, set[str]]

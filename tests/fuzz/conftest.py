@@ -6,9 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from model.baselines import kalman
-from model.baselines import physics
 from loadtest.forward import cab_network
+from model.baselines import kalman, physics
 from model.registry import Registry
 from service.server import Server
 from tests.service.servers import settings

@@ -3,9 +3,9 @@
 import torch
 from torch import Tensor
 
-from model.networks.cvae import CvaeNetworks
 from model.forecaster import ModelInfo, Protocol
 from model.networks.config import AnyNetworkConfig, NetworkConfig
+from model.networks.forecaster import CvaeNetworks
 
 
 def network() -> NetworkConfig:

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from model.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
-from model.networks.cvae import CvaeForecaster
 from model.forecaster import ModelInfo
 from model.networks.config import NetworkConfig
+from model.networks.forecaster import CvaeForecaster
 from tests.model.checkpoints import info, network, tensors
 
 

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from model.baselines.kalman import Kalman
 from model.checkpoint import CheckpointError, save_checkpoint
 from model.forecaster import Forecaster, ModelInfo, Protocol
-from model.baselines.kalman import Kalman
 from model.registry import DuplicateModelError, Registry, UnknownModelError
 from tests.model.checkpoints import info, network, tensors
 

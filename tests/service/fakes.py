@@ -5,9 +5,8 @@ import threading
 import numpy as np
 import torch
 
-from model.baselines import kalman
-from model.baselines import physics
 from model.arrays import Ints
+from model.baselines import kalman, physics
 from model.forecaster import Context, Features, Forecaster, ModelInfo, Protocol, agent_count
 from model.mixture import TrajectoryMixture
 from model.registry import Registry

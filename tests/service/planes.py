@@ -9,8 +9,8 @@ from google.protobuf.message import Message
 
 from cab.forecast.v1 import consistency_service_pb2 as pb
 from cab.forecast.v1 import model_service_pb2 as models_pb
-from service.tracking.service import ConsistencyPlane
 from service.server import Server
+from service.tracking.service import ConsistencyPlane
 
 MODEL = models_pb.ModelReference(name="fake", version="1.0.0", protocol=models_pb.INPUT_PROTOCOL_CAUSAL)
 INSTANT = pb.InstantConsistency(

@@ -1,0 +1,1 @@
+"""Stores of the track memory: this process or Redis, behind one interface."""

@@ -1,9 +1,9 @@
 """The track memory that the settings ask for."""
 
 from service.redis_url import parse_address
-from service.tracking.store.memory import MemoryStore
-from service.tracking.store.base import TrackStore
 from service.settings import Settings
+from service.tracking.store.base import TrackStore
+from service.tracking.store.memory import MemoryStore
 
 MAX_WATCHERS = 64
 """Of one server; with Redis each has a connection of its own."""

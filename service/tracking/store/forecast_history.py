@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 from model.scenes.resample import TIME_TOLERANCE
 from model.scenes.scene import STEP_SECONDS
-from service.tracking.store.records import AGES, BLOCK
 from service.tracking.store.base import AGE_TOLERANCE, MAX_FORECASTS
+from service.tracking.store.records import AGES, BLOCK
 
 REACH = AGE_TOLERANCE + TIME_TOLERANCE
 """s; so far off its lag a forecast may have been made."""

@@ -8,9 +8,9 @@ from typing import Any, TypeVar
 
 import structlog
 
+from service.tracking.store.base import StoreError
 from service.tracking.store.circuit_breaker import Circuit
 from service.tracking.store.failures import Reason, reason_of, store_error
-from service.tracking.store.base import StoreError
 
 _log = structlog.get_logger(__name__)
 

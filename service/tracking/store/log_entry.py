@@ -6,8 +6,8 @@ from typing import Any
 
 import msgpack
 
-from service.tracking.store.records import AGES, FORECAST_BYTES, KINDS, OBSERVATION_BYTES
 from service.tracking.store.base import Sighting
+from service.tracking.store.records import AGES, FORECAST_BYTES, KINDS, OBSERVATION_BYTES
 
 _VERSION = 1
 """Of this layout. Servers leave out what is of another one."""

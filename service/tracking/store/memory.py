@@ -4,10 +4,10 @@ import time as clock
 from collections import OrderedDict
 from collections.abc import AsyncGenerator, Callable, Sequence
 
-from service.tracking.store.log_entry import Entry
-from service.tracking.store.fanout import Fanout
-from service.tracking.store.scene import SceneMemory
 from service.tracking.store.base import Event, Recalled, Remembered, Sighting, TrackStore
+from service.tracking.store.fanout import Fanout
+from service.tracking.store.log_entry import Entry
+from service.tracking.store.scene import SceneMemory
 from service.tracking.store.track import bundle
 
 

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from model.scenes.resample import TIME_TOLERANCE
+from service.tracking.store.base import LATENESS, WINDOW, Fate
 from service.tracking.store.log_entry import Entry
 from service.tracking.store.observation_buffer import Sighted
-from service.tracking.store.base import LATENESS, WINDOW, Fate
 from service.tracking.store.track import Instant, Track
 
 MAX_AGENTS = 4096

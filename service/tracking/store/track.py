@@ -7,10 +7,10 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from model.scenes.scene import STEP_SECONDS
-from service.tracking.store.records import AGES, COMPLETE, NEWLY, SETTLED
+from service.tracking.store.base import MAX_SERIES, SETTLE_AFTER, Instants, Sighting
 from service.tracking.store.forecast_history import REACH, Series, Set
 from service.tracking.store.observation_buffer import Sighted
-from service.tracking.store.base import MAX_SERIES, SETTLE_AFTER, Instants, Sighting
+from service.tracking.store.records import AGES, COMPLETE, NEWLY, SETTLED
 
 _HEAD = struct.Struct(f"<Qddd{AGES}d")
 

@@ -10,13 +10,13 @@ import structlog
 from google.protobuf.message import Message
 from grpc import aio
 
+from service.errors import TooLarge
+from service.settings import Settings
+from service.telemetry.metrics import Metrics
 from service.transports.boundary import to_service_error
 from service.transports.grpc.status import abort
 from service.transports.messages import parse_message
 from service.transports.watching import closing
-from service.errors import TooLarge
-from service.settings import Settings
-from service.telemetry.metrics import Metrics
 
 _log = structlog.get_logger(__name__)
 _Request = TypeVar("_Request", bound=Message)

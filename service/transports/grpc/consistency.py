@@ -5,8 +5,8 @@ from collections.abc import AsyncIterator
 import grpc
 
 from cab.forecast.v1 import consistency_service_pb2 as pb
-from service.transports.grpc.calls import Calls
 from service.predict.pipeline import DataPlane
+from service.transports.grpc.calls import Calls
 
 CONSISTENCY_SERVICE = pb.DESCRIPTOR.services_by_name["ConsistencyService"].full_name
 

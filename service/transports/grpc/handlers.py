@@ -8,14 +8,14 @@ from google.protobuf.message import Message
 
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
-from service.transports.grpc.calls import Calls, Context
-from service.transports.grpc.consistency import CONSISTENCY_SERVICE, ConsistencyHandlers
 from service.predict.pipeline import DataPlane
+from service.predict.protobuf_request import read_request
 from service.predict.request_decoder import LARGE_BYTES, Encoded
 from service.predict.request_limits import Sizes
-from service.predict.protobuf_request import read_request
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
+from service.transports.grpc.calls import Calls, Context
+from service.transports.grpc.consistency import CONSISTENCY_SERVICE, ConsistencyHandlers
 
 PREDICTION_SERVICE = pb.DESCRIPTOR.services_by_name["PredictionService"].full_name
 MODEL_SERVICE = models_pb.DESCRIPTOR.services_by_name["ModelService"].full_name

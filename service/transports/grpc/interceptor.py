@@ -5,10 +5,10 @@ from typing import Any
 
 import grpc
 
-from service.transports.auth import Tokens
-from service.transports.grpc.status import abort
 from service.errors import Unauthenticated
 from service.telemetry.metrics import Metrics
+from service.transports.auth import Tokens
+from service.transports.grpc.status import abort
 
 _OPEN = ("/grpc.health.v1.Health/",)
 """What orchestrators probe without credentials."""

@@ -4,13 +4,13 @@ from grpc import aio
 from grpc_health.v1 import health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
+from service.predict.pipeline import DataPlane
+from service.settings import Settings
+from service.telemetry.metrics import Metrics
 from service.transports.auth import Tokens
 from service.transports.grpc.handlers import SERVICES, Handlers
 from service.transports.grpc.health import HEALTH_SERVICE, Health
 from service.transports.grpc.interceptor import AuthInterceptor
-from service.predict.pipeline import DataPlane
-from service.settings import Settings
-from service.telemetry.metrics import Metrics
 
 _UNLIMITED = -1
 _TRANSPORT_MARGIN = 2

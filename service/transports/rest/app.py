@@ -10,6 +10,10 @@ from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 
+from service.errors import BadField, MethodNotAllowed, NotFound, ServiceError, Unavailable
+from service.predict.pipeline import DataPlane, Phase
+from service.settings import Settings
+from service.telemetry.metrics import Metrics
 from service.transports.boundary import to_service_error
 from service.transports.rest.calls import Calls
 from service.transports.rest.consistency import ConsistencyEndpoints
@@ -17,10 +21,6 @@ from service.transports.rest.endpoints import Endpoints
 from service.transports.rest.openapi import openapi_document
 from service.transports.rest.problem import problem_response
 from service.transports.rest.sending import HoldUntilSent
-from service.predict.pipeline import DataPlane, Phase
-from service.errors import BadField, MethodNotAllowed, NotFound, ServiceError, Unavailable
-from service.settings import Settings
-from service.telemetry.metrics import Metrics
 
 
 def build_app(dataplane: DataPlane, metrics: Metrics, settings: Settings) -> FastAPI:

@@ -11,14 +11,14 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.types import Receive
 
+from service.errors import ServiceError, TooLarge
+from service.settings import Settings
+from service.telemetry.metrics import Call, Metrics
 from service.transports.auth import Tokens
 from service.transports.boundary import to_service_error
 from service.transports.rest.codec import to_json
 from service.transports.rest.negotiation import Format
 from service.transports.rest.problem import problem_response
-from service.errors import ServiceError, TooLarge
-from service.settings import Settings
-from service.telemetry.metrics import Call, Metrics
 
 _log = structlog.get_logger(__name__)
 _T = TypeVar("_T")

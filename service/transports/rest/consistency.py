@@ -8,13 +8,13 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from cab.forecast.v1 import consistency_service_pb2 as pb
+from service.predict.pipeline import DataPlane
 from service.transports.messages import parse_message
 from service.transports.rest.calls import Calls, respond
 from service.transports.rest.codec import parse_json
 from service.transports.rest.events import EventStream
 from service.transports.rest.negotiation import Format, answer_format, request_format
 from service.transports.rest.parameters import read_parameters
-from service.predict.pipeline import DataPlane
 
 _Request = TypeVar("_Request", bound=Message)
 _MAX_BYTES = 2**16

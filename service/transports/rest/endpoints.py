@@ -7,15 +7,15 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from cab.forecast.v1 import model_service_pb2 as models_pb
-from service.transports.rest import requests
-from service.transports.rest.calls import Calls, respond, unless_disconnected
-from service.transports.rest.negotiation import Format, answer_format, request_format, timeout
-from service.transports.rest.sending import held
 from service.predict import protobuf_request
 from service.predict.pipeline import DataPlane
 from service.predict.request_decoder import LARGE_BYTES, Encoded
 from service.predict.request_limits import Sizes
 from service.settings import Settings
+from service.transports.rest import json_request
+from service.transports.rest.calls import Calls, respond, unless_disconnected
+from service.transports.rest.negotiation import Format, answer_format, request_format, timeout
+from service.transports.rest.sending import held
 
 
 class Endpoints:
@@ -59,5 +59,5 @@ class Endpoints:
 
     def _encoded(self, body: bytes, incoming: Format) -> Encoded:
         if incoming is Format.JSON:  # never quick
-            return Encoded(body, functools.partial(requests.read_request, sizes=self._sizes))
-        return Encoded(body, functools.partial(wire.read_request, sizes=self._sizes), LARGE_BYTES)
+            return Encoded(body, functools.partial(json_request.read_request, sizes=self._sizes))
+        return Encoded(body, functools.partial(protobuf_request.read_request, sizes=self._sizes), LARGE_BYTES)

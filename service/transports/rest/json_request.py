@@ -8,9 +8,9 @@ call each, and the rest of the request goes through ``ParseDict``.
 from typing import Any
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
-from service.transports.rest.codec import from_document, load_document
-from service.predict.request_limits import Sizes
 from service.errors import TooLarge
+from service.predict.request_limits import Sizes
+from service.transports.rest.codec import from_document, load_document
 
 _AGENTS = pb.PredictRequest.DESCRIPTOR.fields_by_number[pb.PredictRequest.AGENTS_FIELD_NUMBER].name
 _STATES = pb.Agent.DESCRIPTOR.fields_by_number[pb.Agent.STATES_FIELD_NUMBER].name

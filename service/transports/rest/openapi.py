@@ -6,16 +6,6 @@ from typing import Any
 from google.protobuf.descriptor import Descriptor
 
 from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
-from service.transports.rest.examples import IDS, events_example, predict_examples, reset_examples
-from service.transports.rest.operations import (
-    body_of,
-    events_operation,
-    operation,
-    probe,
-    problem_schema,
-    timeout_parameter,
-)
-from service.transports.rest.schemas import Schema, message_schemas, query_parameters
 from service.errors import (
     BadFields,
     DeadlineExceeded,
@@ -30,6 +20,16 @@ from service.errors import (
     UnsupportedMediaType,
 )
 from service.settings import Settings
+from service.transports.rest.examples import IDS, events_example, predict_examples, reset_examples
+from service.transports.rest.operations import (
+    body_of,
+    events_operation,
+    operation,
+    probe,
+    problem_schema,
+    timeout_parameter,
+)
+from service.transports.rest.schemas import Schema, message_schemas, query_parameters
 
 _DESCRIPTION = """Forecasts where road users will be in the next seconds, as Gaussian mixtures.
 

@@ -3,10 +3,6 @@
 from collections.abc import Sequence
 from typing import Any
 
-from service.transports.rest import problem
-from service.transports.rest.comments import comments
-from service.transports.rest.negotiation import EVENTS, TIMEOUT_HEADER, Format
-from service.transports.rest.schemas import Schema, reference
 from service.errors import (
     Internal,
     NotAcceptable,
@@ -16,6 +12,10 @@ from service.errors import (
     Unauthenticated,
     Unavailable,
 )
+from service.transports.rest import problem
+from service.transports.rest.comments import comments
+from service.transports.rest.negotiation import EVENTS, TIMEOUT_HEADER, Format
+from service.transports.rest.schemas import Schema, reference
 
 Errors = tuple[type[ServiceError], ...]
 

@@ -5,8 +5,8 @@ from typing import TypeVar
 from google.protobuf.message import Message
 from starlette.datastructures import QueryParams
 
-from service.transports.rest.codec import from_document
 from service.errors import BadField
+from service.transports.rest.codec import from_document
 
 _M = TypeVar("_M", bound=Message)
 

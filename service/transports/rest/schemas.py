@@ -8,11 +8,11 @@ from google.protobuf.descriptor import Descriptor, EnumDescriptor, FieldDescript
 from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
-from service.transports.rest.comments import comments
-from service.predict.options import MAX_POSITION, MAX_TIME
-from service.tracking.store.base import WINDOW
 from service.limits import MAX_ID_LENGTH
+from service.predict.options import MAX_POSITION, MAX_TIME
 from service.settings import Settings
+from service.tracking.store.base import WINDOW
+from service.transports.rest.comments import comments
 
 Schema = dict[str, Any]
 

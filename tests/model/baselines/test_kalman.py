@@ -6,10 +6,10 @@ from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 
 from model.arrays import Floats
-from model.forecaster import join
 from model.baselines.kalman import HISTORY_FRAMES, NOISE, Kalman, Noise
+from model.forecaster import join
 from model.scenes.scene import AgentType
-from tests.model.scenes import present, tracks
+from tests.model.made_scenes import present, tracks
 
 KALMAN = Kalman()
 NOW = np.zeros(1, dtype=np.int64)

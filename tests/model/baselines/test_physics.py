@@ -6,12 +6,12 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from model.arrays import Floats
+from model.baselines.physics import Physics, baselines
+from model.baselines.uncertainty import Growth, Spread, SpreadBySpeed, aligned_covariance, ellipse_radius
 from model.forecaster import Context, Protocol, agent_count, join
 from model.mixture import TrajectoryMixture
-from model.baselines.physics import Physics, baselines
 from model.scenes.scene import AgentStates, AgentType, Scene
-from model.baselines.uncertainty import Growth, Spread, SpreadBySpeed, aligned_covariance, ellipse_radius
-from tests.model.scenes import present
+from tests.model.made_scenes import present
 
 TIMES = 0.5 * np.arange(1, 13)
 BY_NAME = {forecaster.info.name: forecaster for forecaster in baselines()}

@@ -6,8 +6,8 @@ from safetensors.torch import load_file
 
 from model.convert.errors import ConversionError
 from model.convert.names import rename
-from model.networks.cvae import CvaeNetworks
 from model.networks.config import BlindContext, NetworkConfig
+from model.networks.forecaster import CvaeNetworks
 
 ONE = torch.ones(1)
 

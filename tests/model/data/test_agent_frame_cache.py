@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from model.features.agent_features import agent_frame_features
 from model.data.batches import Batches, JoinedPairs
 from model.data.cache import Cache, build_cache
 from model.data.caches import open_cache
 from model.data.packing import unpack_patches
 from model.data.protocols import frame_scene
 from model.data.scenes import DataError, Pair, SceneRecord, Track
+from model.features.agent_features import agent_frame_features
 from model.forecaster import Context, Protocol
 from model.networks.config import Frame, NetworkConfig
 from model.scenes.scene import AgentType

@@ -5,14 +5,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from model.data.protocols import frame_scene
 from model.data.augmentation import rotate
+from model.data.protocols import frame_scene
 from model.data.scenes import SceneRecord
 from model.features.scene_features import scene_features
+from model.features.standardization import HEADING
 from model.forecaster import Context, Features, Protocol
 from model.networks.config import NetworkConfig
 from model.scenes.scene import AgentType
-from model.features.standardization import HEADING
 from tests.model.data.records import record, turned
 
 CONFIG = NetworkConfig()

@@ -11,9 +11,8 @@ import pytest
 from model.data.cache import Cache, CacheKey, build_cache
 from model.data.protocols import frame_scene
 from model.data.scenes import DataError, Pair, SceneRecord
-from model.features.scene_features import scene_features
+from model.features.scene_features import network_features, scene_features
 from model.forecaster import Context, Protocol
-from model.features.inputs import network_features
 from model.networks.config import AnyNetworkConfig, BlindContext, CoverNetConfig, NetworkConfig
 from model.scenes.scene import AgentType
 from tests.model.data.records import FixedReader, raster, record, track

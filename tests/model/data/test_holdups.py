@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from model.features.agent_features import NEIGHBOR_POSITION_SCALE, NEIGHBOR_REACH_M, NEIGHBORS
 from loadtest.forward import features_in_agent_frame
 from model.data.holdups import ASIDE_M, BLOCKED, GAP_M, block, hold
+from model.features.agent_features import NEIGHBOR_POSITION_SCALE, NEIGHBOR_REACH_M, NEIGHBORS
 from model.forecaster import Features
 
 COUNT = 4000

@@ -5,17 +5,17 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from model.features.agent_features import agent_frame_features
-from model.data.mirroring import mirror
+from model.data.augmentation import mirror
 from model.data.protocols import frame_scene
 from model.data.scenes import SceneRecord, Track
+from model.features.agent_features import agent_frame_features
+from model.features.neighbor_boxes import surroundings
 from model.features.scene_features import scene_features
+from model.features.standardization import HEADING
 from model.forecaster import Context, Features, Protocol
 from model.networks.config import Frame, NetworkConfig
 from model.networks.rasterize_boxes import draw_boxes
 from model.scenes.scene import AgentType, Raster
-from model.features.standardization import HEADING
-from model.features.neighbor_boxes import surroundings
 from tests.model.data.records import record
 
 CONFIG = NetworkConfig()

@@ -5,10 +5,10 @@ from pathlib import Path
 import torch
 
 from model.checkpoint import save_checkpoint
-from model.covernet import CoverNetworks
 from model.evaluation.results import Results, Row
 from model.forecaster import Protocol
 from model.networks.config import BlindContext, CoverNetConfig, NetworkConfig
+from model.networks.forecaster import CoverNetworks
 from tests.model.checkpoints import info, tensors
 
 FULL = NetworkConfig(blind=BlindContext.NULL, modes=3)

@@ -1,10 +1,10 @@
 import torch
 
 from loadtest.forward import features
-from model.networks.cvae import CvaeForecaster
 from model.evaluation.ablation import Without, ablations, without_both, without_map, without_neighbors
 from model.forecaster import Context, Features
 from model.networks.config import NetworkConfig
+from model.networks.forecaster import CvaeForecaster
 from model.scenes.scene import AgentType
 from tests.model.checkpoints import info, tensors
 from tests.model.evaluation.builders import ALONE, FULL

@@ -5,16 +5,16 @@ import pytest
 import torch
 
 from model.baselines import physics
+from model.baselines.kalman import Kalman
+from model.baselines.unimodal import single_mode
 from model.data.cache import Cache, build_cache
 from model.data.protocols import frame_scene
 from model.data.scenes import DataError, Pair, SceneRecord
 from model.evaluation.baselines import judge_baselines, scene_pairs
 from model.forecaster import Protocol
-from model.baselines.kalman import Kalman
 from model.metrics.evaluate import instance_metrics
 from model.metrics.oracle import ORACLE, PHYSICS, oracle_mixture
 from model.networks.config import NetworkConfig
-from model.baselines.unimodal import single_mode
 from tests.model.data.records import FixedReader, raster, record, track
 
 READER = FixedReader(record(), record("scene-2", seed=1))

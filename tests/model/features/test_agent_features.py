@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from model.features.agent_features import HISTORY_SCALE, NEIGHBORS, agent_frame_features
 from model.arrays import Bytes, Float32s, Ints
+from model.features.agent_features import HISTORY_SCALE, NEIGHBORS, agent_frame_features
 from model.forecaster import Context
 from model.geometry import rotate
 from model.networks.config import Frame, NetworkConfig
 from model.scenes.raster import FAR, NEAR, cut_patches
 from model.scenes.scene import AgentStates, AgentType, Raster, Scene
-from tests.model.scenes import crowd, moved, present
+from tests.model.made_scenes import crowd, moved, present
 
 CONFIG = NetworkConfig(frame=Frame.AGENT, far_map=True)
 VEHICLES: Ints = np.arange(4)

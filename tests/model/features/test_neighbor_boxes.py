@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model.arrays import Floats
+from model.features.neighbor_boxes import BOX_SIZE, BOXES, surroundings
 from model.geometry import rotate, wrap_angle
 from model.scenes.scene import AgentStates, AgentType, Scene
-from model.features.neighbor_boxes import BOX_SIZE, BOXES, surroundings
 
 BOTH = (AgentType.VEHICLE, AgentType.PEDESTRIAN)
 OWN = np.array([0])

@@ -6,10 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from model.arrays import Floats
-from model.geometry import rotate, wrap_angle
 from model.features.neighbors import edge_ramps, neighbor_sums
-from model.scenes.scene import AgentStates, AgentType
 from model.features.standardization import ATTENTION_RADIUS, HEADING, state_scale, state_vectors
+from model.geometry import rotate, wrap_angle
+from model.scenes.scene import AgentStates, AgentType
 
 VEHICLE, PEDESTRIAN = AgentType.VEHICLE, AgentType.PEDESTRIAN
 FRAMES = 5

@@ -2,9 +2,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from model.baselines.physics import baselines
 from model.metrics.displacement import ade_m, displacement_m
 from model.metrics.oracle import PHYSICS, Criterion, physics_oracle
-from model.baselines.physics import baselines
 
 
 def test_it_chooses_from_the_physics_baselines() -> None:

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from model.features.standardization import state_scale
 from model.forecaster import Features
 from model.scenes.scene import AgentType
-from model.features.standardization import state_scale
 
 TYPES = (AgentType.VEHICLE, AgentType.PEDESTRIAN)
 

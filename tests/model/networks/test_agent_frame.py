@@ -10,16 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from model.features.agent_features import agent_frame_features
 from loadtest.forward import cab_network, features_in_agent_frame
 from model.checkpoint import load_checkpoint, save_checkpoint
-from model.networks.cvae import CvaeForecaster, CvaeNetworks
+from model.features.agent_features import agent_frame_features
 from model.forecaster import Context, Features
 from model.networks.agent_frame import STEPS, AgentFrameNetwork, Modes, drive, read_patch
 from model.networks.config import BlindContext, Frame, NetworkConfig
+from model.networks.forecaster import CvaeForecaster, CvaeNetworks
 from model.scenes.raster import FAR, NEAR, PatchGeometry
 from model.scenes.scene import AgentType
-from tests.model.scenes import crowd, moved
+from tests.model.made_scenes import crowd, moved
 
 CONFIG = NetworkConfig(frame=Frame.AGENT, far_map=True, blind=BlindContext.NULL)
 VEHICLES = np.arange(4)

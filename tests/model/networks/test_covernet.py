@@ -9,15 +9,15 @@ import torch
 from torch import Tensor
 
 from model.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
-from model.covernet import CoverNetForecaster, CoverNetworks
 from model.forecaster import Context, join
 from model.geometry import rotate, wrap_angle
 from model.networks.config import CoverNetConfig
 from model.networks.covernet import CoverNet
+from model.networks.forecaster import CoverNetForecaster, CoverNetworks
 from model.registry import Registry
 from model.scenes.scene import AgentType, Scene
 from tests.model.checkpoints import info
-from tests.model.networks.test_cvae import TYPES, VEHICLES, scene
+from tests.model.networks.test_forecaster import TYPES, VEHICLES, scene
 
 MEMBERS = 40
 CONFIG = CoverNetConfig(members=MEMBERS)

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from model.networks.rasterize_boxes import draw_boxes
 from model.features.neighbor_boxes import BOX_SIZE, BOXES
+from model.networks.rasterize_boxes import draw_boxes
 
 SIZES = list(BOX_SIZE.values())
 

@@ -4,10 +4,10 @@ import torch
 from torch import Tensor
 
 from loadtest.forward import features
+from model.features.neighbor_boxes import BOX_NUMBERS, BOXES
 from model.forecaster import Features
 from model.networks.config import AnyNetworkConfig, BlindContext, CoverNetConfig, NetworkConfig
 from model.networks.covernet import present_heading, turned
-from model.features.neighbor_boxes import BOX_NUMBERS, BOXES
 from model.training.config import Method, TrainingConfig
 
 

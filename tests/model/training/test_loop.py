@@ -10,11 +10,10 @@ import torch
 from pydantic import ValidationError
 from torch import Tensor, nn
 
-from model.networks.cvae import CvaeNetworks
 from model.forecaster import Context
-from model.networks.forecaster import Networks
 from model.networks.config import NetworkConfig
 from model.networks.covernet import CoverNet
+from model.networks.forecaster import CvaeNetworks, Networks
 from model.scenes.scene import AgentType
 from model.training.config import Method, TrainingConfig, TrainingError, load_config
 from model.training.dropout import scale_dropout

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from model.features.agent_features import NEIGHBOR_POSITION_SCALE, NEIGHBOR_VELOCITY_SCALE
 from loadtest.forward import features_in_agent_frame
+from model.features.agent_features import NEIGHBOR_POSITION_SCALE, NEIGHBOR_VELOCITY_SCALE
 from model.forecaster import Context, Features
 from model.networks.agent_frame import STEPS, AgentFrameNetwork
 from model.networks.config import BlindContext, Frame, NetworkConfig

@@ -7,8 +7,8 @@ from pathlib import Path
 import torch
 from safetensors.torch import load_file
 
-from model.networks.cvae import CvaeNetworks
 from model.networks.config import BlindContext, NetworkConfig
+from model.networks.forecaster import CvaeNetworks
 from model.training import processes
 
 

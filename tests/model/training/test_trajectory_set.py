@@ -67,7 +67,7 @@ def test_members_are_paths_and_the_variance_is_about_the_nearest(paths: Float32s
 def test_little_memory_gives_the_same_cover(monkeypatch: pytest.MonkeyPatch) -> None:
     paths = wandering(400)
     whole, parts = make_cover(torch.from_numpy(paths), EPSILON), cover_indices(paths, EPSILON)
-    monkeypatch.setattr(cover, "_PAIRS", 100)
+    monkeypatch.setattr(trajectory_set, "_PAIRS", 100)
     np.testing.assert_array_equal(cover_indices(paths, EPSILON), parts)
     again = make_cover(torch.from_numpy(paths), EPSILON)
     assert torch.equal(whole.members, again.members)
@@ -87,6 +87,6 @@ def test_what_cannot_be_covered_is_refused(paths: Float32s) -> None:
 
 
 def test_a_cover_that_does_not_cover_is_a_fault(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cover, "cover_indices", lambda paths, epsilon: np.array([0]))
+    monkeypatch.setattr(trajectory_set, "cover_indices", lambda paths, epsilon: np.array([0]))
     with pytest.raises(ArithmeticError, match="away from its cover"):
         make_cover(torch.from_numpy(wandering(50)), EPSILON)

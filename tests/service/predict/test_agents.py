@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.scenes.scene import AgentType
-from service.predict.agents import read_agents
 from service.errors import Fault
+from service.predict.agents import read_agents
 from service.settings import Settings
 from tests.service.requests import NOW, PEDESTRIAN, add_agent, make_request, pack, png
 from tests.service.timing import cpu_seconds

@@ -8,8 +8,8 @@ import torch
 
 from model.forecaster import Context, Features
 from model.scenes.scene import AgentType
-from service.predict.batcher import Admission, Batcher, Job, Outcome
 from service.errors import DeadlineExceeded, Internal, Overloaded, Unavailable
+from service.predict.batcher import Admission, Batcher, Job, Outcome
 from service.telemetry.metrics import Metrics
 from tests.service.fakes import FakeForecaster
 

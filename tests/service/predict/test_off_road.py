@@ -7,8 +7,8 @@ from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.mixture import TrajectoryMixture
 from model.scenes.scene import Raster
 from service.predict.encode import Result
-from service.predict.plan import Draft
 from service.predict.off_road import count_off_road
+from service.predict.plan import Draft
 from tests.service.fakes import FakeForecaster
 
 

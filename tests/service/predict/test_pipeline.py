@@ -13,9 +13,9 @@ from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.forecaster import Context, Protocol
 from model.scenes.scene import AgentType
+from service.errors import BadField, BadFields, DeadlineExceeded, Overloaded, Unavailable, UnknownModel
 from service.predict.pipeline import DataPlane, Phase
 from service.predict.request_decoder import Encoded
-from service.errors import BadField, BadFields, DeadlineExceeded, Overloaded, Unavailable, UnknownModel
 from service.settings import FALLBACK_MODEL, SettingsError
 from service.telemetry.metrics import Metrics
 from tests.service.fakes import FakeForecaster, registry

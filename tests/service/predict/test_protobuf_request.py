@@ -8,10 +8,10 @@ from google.protobuf.message import DecodeError
 from hypothesis import given
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
-from service.predict.agents import read_agents
-from service.predict.request_limits import Sizes
-from service.predict.protobuf_request import read_request
 from service.errors import BadField, ServiceError, TooLarge
+from service.predict.agents import read_agents
+from service.predict.protobuf_request import read_request
+from service.predict.request_limits import Sizes
 from service.settings import Settings
 from tests.service.requests import add_agent, make_request
 from tests.service.timing import cpu_seconds

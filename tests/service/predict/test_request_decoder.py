@@ -8,8 +8,8 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
-from service.predict.request_decoder import LARGE_BYTES, MAX_WAITING, Encoded, Reader
 from service.errors import BadField, Overloaded
+from service.predict.request_decoder import LARGE_BYTES, MAX_WAITING, Encoded, Reader
 
 SMALL, LARGE = bytes(1000), bytes(LARGE_BYTES + 1)
 

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from model.arrays import Floats
+from service.tracking.aggregates import CONVERGENCES, DISPERSIONS, ERRORS, Sums
 from service.tracking.metrics import figures
 from service.tracking.quantile_sketch import Sketches
-from service.tracking.aggregates import CONVERGENCES, DISPERSIONS, ERRORS, Sums
 from service.tracking.store.records import COMPLETE, SETTLED
 from tests.service.tracking.test_metrics import instants
 

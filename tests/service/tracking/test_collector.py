@@ -4,9 +4,9 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
-from service.tracking.metrics import figures
 from service.tracking.aggregates import Sums
 from service.tracking.collector import ConsistencyCollector, StoreMetrics
+from service.tracking.metrics import figures
 from tests.service.tracking.test_metrics import instants
 
 

@@ -1,0 +1,1 @@
+"""The track memory in Redis: single, Sentinel or Cluster."""

@@ -16,7 +16,7 @@ class Script:
     """
 
     def __init__(self, name: str) -> None:
-        self._text = (resources.files("service.history") / name).read_text(encoding="utf-8")
+        self._text = (resources.files("service.tracking.store.redis") / name).read_text(encoding="utf-8")
         self._digest = hashlib.sha1(self._text.encode(), usedforsecurity=False).hexdigest()
 
     async def run(self, client: Any, keys: Sequence[str], arguments: Sequence[str | bytes | int]) -> Any:

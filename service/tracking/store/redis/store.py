@@ -19,12 +19,12 @@ import structlog
 from redis.asyncio import Redis
 from redis.exceptions import ReadOnlyError
 
-from service.tracking.store.log_entry import Entry, EntryError, pack_entry, unpack_entry
-from service.tracking.store.failures import reason_of, store_error
-from service.tracking.store.redis.keys import SceneKeys
-from service.tracking.store.scene import Outcome, SceneMemory
-from service.tracking.store.redis.scripts import Script
 from service.tracking.store.base import Event, Recalled, Remembered, Sighting, TrackStore
+from service.tracking.store.failures import reason_of, store_error
+from service.tracking.store.log_entry import Entry, EntryError, pack_entry, unpack_entry
+from service.tracking.store.redis.keys import SceneKeys
+from service.tracking.store.redis.scripts import Script
+from service.tracking.store.scene import Outcome, SceneMemory
 from service.tracking.store.track import Instant, bundle
 
 _log = structlog.get_logger(__name__)

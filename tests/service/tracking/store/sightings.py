@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from model.arrays import Floats
-from service.tracking.store.records import BLOCK, FORECAST_BLOCKS, OBSERVATION_FIELDS
 from service.tracking.store.base import Sighting
+from service.tracking.store.records import BLOCK, FORECAST_BLOCKS, OBSERVATION_FIELDS
 
 SERIES = "cab@1.0.0"
 START = 1.6e9

@@ -5,10 +5,10 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 from service.redis_url import parse_address
-from service.tracking.store.redis.connection import connect
-from service.tracking.store.memory import MemoryStore
-from service.tracking.store.redis.store import RedisStore
 from service.tracking.store.base import TrackStore
+from service.tracking.store.memory import MemoryStore
+from service.tracking.store.redis.connection import connect
+from service.tracking.store.redis.store import RedisStore
 
 EXPIRY = 30.0
 MAX_AGENTS = 10_000

@@ -5,8 +5,8 @@ from collections.abc import AsyncIterator, Sequence
 
 import pytest
 
-from service.tracking.store.records import COMPLETE, NEWLY, SETTLED, unpack_instants
 from service.tracking.store.base import Event, Fate, Recalled, Sighting, TrackStore
+from service.tracking.store.records import COMPLETE, NEWLY, SETTLED, unpack_instants
 from tests.service.tracking.store.sightings import SERIES, observation, sighting, times, where
 from tests.service.tracking.store.stores import memory, opened, scene_name
 

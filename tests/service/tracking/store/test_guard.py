@@ -11,9 +11,9 @@ import pytest
 from redis import exceptions as redis_errors
 
 from service.redis_url import parse_address
-from service.tracking.store.redis.connection import connect
-from service.tracking.store.guard import Guard
 from service.tracking.store.base import StoreError
+from service.tracking.store.guard import Guard
+from service.tracking.store.redis.connection import connect
 from tests.service.tracking.store.redis_servers import FaultProxy
 
 LONG = 30.0

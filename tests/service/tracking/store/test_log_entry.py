@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from service.tracking.store.base import Sighting
 from service.tracking.store.log_entry import Entry, EntryError, pack_entry, unpack_entry
 from service.tracking.store.records import FORECAST_BYTES, OBSERVATION_BYTES
-from service.tracking.store.base import Sighting
 
 SIGHTINGS = st.builds(
     Sighting,

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from service.tracking.store.base import MAX_FORECASTS, MAX_SERIES, SETTLE_AFTER, WINDOW, Fate, Sighting
 from service.tracking.store.log_entry import Entry
 from service.tracking.store.records import AGES, COMPLETE, NEWLY, SETTLED, unpack_instants
 from service.tracking.store.scene import Outcome, SceneMemory
-from service.tracking.store.base import MAX_FORECASTS, MAX_SERIES, SETTLE_AFTER, WINDOW, Fate, Sighting
 from service.tracking.store.track import bundle
 from tests.service.tracking.store.sightings import SERIES, START, observation, sighting, times, where
 

@@ -15,8 +15,8 @@ from hypothesis import given
 
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
-from service.transports.rest.codec import parse_json, to_dict, to_json
 from service.errors import BadField
+from service.transports.rest.codec import parse_json, to_dict, to_json
 
 MESSAGES: list[type[Message]] = [
     pb.PredictRequest,

@@ -12,11 +12,11 @@ from google.protobuf import json_format
 from hypothesis import given
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
-from service.transports.rest.codec import parse_json
-from service.transports.rest.requests import read_request
-from service.predict.request_limits import Sizes
 from service.errors import BadField, TooLarge
+from service.predict.request_limits import Sizes
 from service.settings import Settings
+from service.transports.rest.codec import parse_json
+from service.transports.rest.json_request import read_request
 from tests.service.requests import add_agent, make_request
 from tests.service.timing import cpu_seconds
 

@@ -3,6 +3,7 @@
 import pytest
 from starlette.datastructures import Headers
 
+from service.errors import BadField, NotAcceptable, UnsupportedMediaType
 from service.transports.rest.negotiation import (
     Format,
     answer_format,
@@ -10,7 +11,6 @@ from service.transports.rest.negotiation import (
     request_format,
     timeout,
 )
-from service.errors import BadField, NotAcceptable, UnsupportedMediaType
 
 JSON, PROTOBUF = Format.JSON, Format.PROTOBUF
 

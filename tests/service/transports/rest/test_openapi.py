@@ -10,13 +10,13 @@ from pydantic import SecretStr
 from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
+from service.settings import Settings
+from service.tracking.store.base import WINDOW
 from service.transports.rest.codec import to_dict
 from service.transports.rest.comments import comments, parse_comments
 from service.transports.rest.examples import IDS, predict_examples, reset_examples
 from service.transports.rest.openapi import openapi_document
 from service.transports.rest.schemas import REQUIRED, bounds
-from service.tracking.store.base import WINDOW
-from service.settings import Settings
 from tests.service.fakes import FakeForecaster
 from tests.service.servers import running
 

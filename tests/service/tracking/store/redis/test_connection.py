@@ -15,8 +15,8 @@ from redis import exceptions as redis_errors
 from redis.asyncio.cluster import ClusterNode
 from redis.asyncio.sentinel import SentinelConnectionPool
 
-from service.tracking.store.redis import cluster
 from service.redis_url import Endpoint, Layout, RedisAddress, parse_address
+from service.tracking.store.redis import cluster
 from service.tracking.store.redis.connection import CLIENT_NAME, connect
 from tests.service.tracking.store import redis_servers
 from tests.service.tracking.store.redis_servers import HOST, Cluster, FaultProxy, Process, Sentinels

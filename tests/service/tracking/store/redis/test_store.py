@@ -9,10 +9,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from redis.exceptions import OutOfMemoryError
 
-from service.tracking.store.redis.keys import SceneKeys
-from service.tracking.store.records import NEWLY, unpack_instants
-from service.tracking.store.redis.store import MAX_ENTRIES, RedisStore
 from service.tracking.store.base import Event, Fate, Recalled, TrackStore
+from service.tracking.store.records import NEWLY, unpack_instants
+from service.tracking.store.redis.keys import SceneKeys
+from service.tracking.store.redis.store import MAX_ENTRIES, RedisStore
 from tests.service.tracking.store.redis_servers import Process, single
 from tests.service.tracking.store.sightings import START, sighting, times
 from tests.service.tracking.store.stores import memory, opened, scene_name

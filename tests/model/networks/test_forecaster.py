@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from model.arrays import Ints
 from loadtest.forward import cab_network
-from model.networks.cvae import CvaeForecaster, CvaeNetworks
+from model.arrays import Ints
 from model.forecaster import Context, ModelInfo, join
 from model.networks.config import BlindContext, NetworkConfig
+from model.networks.forecaster import CvaeForecaster, CvaeNetworks
 from model.scenes.resample import resample
 from model.scenes.scene import AgentType, Raster, Scene
 from tests.model.builders import observations
