@@ -7,9 +7,8 @@ import time
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import asynccontextmanager, contextmanager, suppress
+from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import TypeVar
 
 import numpy as np
@@ -20,7 +19,8 @@ from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.forecaster import Forecaster
 from model.scenes.resample import history_seconds
-from service.errors import BadField, DeadlineExceeded, Fault, Unavailable, UnknownModel
+from service.errors import BadField, DeadlineExceeded, Fault, Unavailable
+from service.lifecycle import Lifecycle, Phase
 from service.predict.agents import Agents, read_agents
 from service.predict.batcher import Admission, Batcher, Outcome
 from service.predict.catalog import Catalog, Models, build_catalog, reference
@@ -35,7 +35,8 @@ from service.predict.warmup import warm_up
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
 from service.tracking.collector import ConsistencyCollector, StoreMetrics
-from service.tracking.service import ConsistencyPlane
+from service.tracking.model_references import ModelReferences
+from service.tracking.service import ConsistencyService
 from service.tracking.store.base import Sighting
 from service.tracking.store.factory import make_store
 from service.tracking.store.guard import Guard
@@ -47,14 +48,6 @@ _T = TypeVar("_T")
 _MAX_WORKERS = 8
 _RESERVE = 0.005
 """s before a call's deadline at which it no longer waits for the track memory."""
-
-
-class Phase(StrEnum):
-    """Where a server is in its life."""
-
-    STARTING = "starting"
-    READY = "ready"
-    DRAINING = "draining"
 
 
 @dataclass(frozen=True)
@@ -94,6 +87,8 @@ class DataPlane:
         self._settings = settings
         self._metrics = metrics
         self._catalog: Catalog | None = None
+        self._lifecycle = Lifecycle()
+        self._references = ModelReferences()
         self._batcher = Batcher(
             settings.max_batch_agents, settings.max_queue_agents, metrics, threads=settings.threads
         )
@@ -109,22 +104,18 @@ class DataPlane:
         # Of its own: those who ask for much, and wait for it, must not open the circuit of the forecasts
         self._asking = Guard(store_metrics.observe, store_metrics.failed)
         self._tracker = Tracker(
-            self._store, self._guard, self._asking, settings.store_budget_ms / 1000, self._reference_of
+            self._store, self._guard, self._asking, settings.store_budget_ms / 1000, self._references
         )
         metrics.registry.register(ConsistencyCollector(self._tracker.sums))
-        self.consistency = ConsistencyPlane(
-            self._store, self._asking, self._tracker.sums, self._reference_of, self._require_ready
+        self.consistency = ConsistencyService(
+            self._store, self._asking, self._tracker, self._references, self._lifecycle
         )
         """The calls about consistency."""
-        self._phase = Phase.STARTING
-        self._calls = 0
-        self._idle = asyncio.Event()
-        self._idle.set()
 
     @property
     def phase(self) -> Phase:
         """Where this server is in its life."""
-        return self._phase
+        return self._lifecycle.phase
 
     async def open(self, load: Callable[[], Models]) -> None:
         """Loads and warms up; calls are taken from then on.
@@ -142,23 +133,21 @@ class DataPlane:
         await warm_up(self._batcher, catalog, self._settings.max_batch_agents)
         self._metrics.set_models(models.infos(), catalog.default.info)
         self._catalog = catalog
-        if self._phase is Phase.STARTING:  # a signal may have come meanwhile
-            self._phase = Phase.READY
+        self._references.set_loaded(reference(info) for info in models.infos())
+        self._lifecycle.set_ready()
 
     def refuse(self) -> None:
         """No more calls; those accepted go on, but for those that watch."""
-        self._phase = Phase.DRAINING
+        self._lifecycle.refuse()
         self.consistency.end_watching()
 
     async def drain(self, seconds: float) -> bool:
         """Waits until the answers of all accepted calls are out, so long at most; whether they are."""
         self.refuse()
-        try:
-            async with asyncio.timeout(seconds):
-                await self._idle.wait()
-        except TimeoutError:
-            _log.warning("calls left unanswered", calls=self._calls)
-        return self._calls == 0
+        idle = await self._lifecycle.wait_idle(seconds)
+        if not idle:
+            _log.warning("calls left unanswered", calls=self._lifecycle.calls)
+        return idle
 
     async def close(self) -> None:
         """Stops the threads."""
@@ -185,14 +174,8 @@ class DataPlane:
         self._batcher.check()
         limit = self._settings.max_timeout
         seconds = limit if timeout is None else min(timeout, limit)
-        self._calls += 1
-        self._idle.clear()
-        try:
+        with self._lifecycle.in_progress():
             yield Call(asyncio.get_running_loop().time() + seconds, catalog)
-        finally:
-            self._calls -= 1
-            if self._calls == 0:
-                self._idle.set()
 
     async def predict(
         self, request: pb.PredictRequest | Encoded, call: Call | None = None
@@ -337,17 +320,10 @@ class DataPlane:
             text = pb.ForecastStatus.Name(status).removeprefix("FORECAST_STATUS_").lower()
             self._metrics.agents.labels(name, text).inc(count)
 
-    def _reference_of(self, series: str) -> models_pb.ModelReference:
-        """The model that name@version names; it may be loaded on another server only."""
-        if self._catalog is not None:
-            with suppress(UnknownModel):
-                return reference(self._catalog.get(series).info)
-        name, _, version = series.partition("@")
-        return models_pb.ModelReference(name=name, version=version)
-
     def _require_ready(self) -> Catalog:
-        if self._catalog is None or self._phase is not Phase.READY:
-            raise Unavailable(f"the server is {self._phase.value}")
+        self._lifecycle.require_ready()
+        if self._catalog is None:
+            raise Unavailable("the server is starting")
         return self._catalog
 
     async def _in_thread(self, function: Callable[..., _T], *arguments: object) -> _T:

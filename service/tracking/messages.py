@@ -1,23 +1,21 @@
 """Figures into the contract's messages."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from cab.forecast.v1 import consistency_service_pb2 as pb
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from model.metrics.convergence import RANGES_M
 from service.tracking.aggregates import CONVERGENCES, DISPERSIONS, ERRORS, ModelSums, Sums
 from service.tracking.metrics import AGES_S, Figures
+from service.tracking.model_references import ModelReferences
 from service.tracking.quantile_sketch import Spread
-
-ReferenceOf = Callable[[str], models_pb.ModelReference]
-"""The model that name@version names."""
 
 _QUANTILES = (0.5, 0.9, 0.99)
 
 
 def instant_messages(
-    figures: Figures, agent_ids: Sequence[str], series: Sequence[str], reference_of: ReferenceOf
+    figures: Figures, agent_ids: Sequence[str], series: Sequence[str], references: ModelReferences
 ) -> list[pb.InstantConsistency]:
     """P messages.
 
@@ -25,7 +23,7 @@ def instant_messages(
         figures: of P instants.
         agent_ids: P, whose observations.
         series: P, whose forecasts.
-        reference_of: a series' model.
+        references: references to models.
     """
     errors, nearest = figures.errors_m.tolist(), figures.nearest.tolist()
     convergence = figures.convergence_s.tolist()
@@ -37,7 +35,7 @@ def instant_messages(
         message = pb.InstantConsistency(
             agent_id=agent_ids[row],
             time=time,
-            model=reference_of(series[row]),
+            model=references.get(series[row]),
             complete=complete,
             settled=settled,
             errors=[
@@ -59,10 +57,10 @@ def instant_messages(
     return messages
 
 
-def model_messages(sums: Sums, reference_of: ReferenceOf) -> list[pb.ModelConsistency]:
+def model_messages(sums: Sums, references: ModelReferences) -> list[pb.ModelConsistency]:
     """One message a model that has a settled set, by name and version."""
     return [
-        _model_message(sums.models[name], reference_of(name))
+        _model_message(sums.models[name], references.get(name))
         for name in sorted(sums.models)
         if sums.models[name].instants
     ]

@@ -1,18 +1,20 @@
 """The calls about consistency, from request message to answer message; the transports only carry them."""
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Sequence
 
 from cab.forecast.v1 import consistency_service_pb2 as pb
 from service.errors import BadField, Overloaded, TrackingUnavailable, UnknownTrack
+from service.lifecycle import Lifecycle
 from service.limits import too_long
 from service.tracking.aggregates import Sums
-from service.tracking.messages import ReferenceOf, instant_messages, model_messages
+from service.tracking.messages import instant_messages, model_messages
 from service.tracking.metrics import Figures, figures
+from service.tracking.model_references import ModelReferences
 from service.tracking.store.base import WINDOW, Remembered, StoreError, TrackStore
 from service.tracking.store.factory import MAX_WATCHERS
 from service.tracking.store.guard import Guard
-from service.tracking.tracker import PATIENCE
+from service.tracking.tracker import PATIENCE, Tracker
 
 DEFAULT_WINDOW = 2.0
 """s back from an agent's newest observation."""
@@ -22,30 +24,30 @@ _WATCH_RETRY = 5.0
 """s until a place among the watchers may be free."""
 
 
-class ConsistencyPlane:
+class ConsistencyService:
     """What the track memory tells those who ask for it.
 
     Args:
         store: the memory.
         guard: of the calls to it.
-        sums: gives those over the process's life.
-        reference_of: a series' model.
-        require_ready: raises ``Unavailable`` while calls are not taken.
+        tracker: the tracker of the Predict calls.
+        references: references to models.
+        lifecycle: the lifecycle of the server.
     """
 
     def __init__(
         self,
         store: TrackStore,
         guard: Guard,
-        sums: Callable[[], Sums],
-        reference_of: ReferenceOf,
-        require_ready: Callable[[], object],
+        tracker: Tracker,
+        references: ModelReferences,
+        lifecycle: Lifecycle,
     ) -> None:
         self._store = store
         self._guard = guard
-        self._sums = sums
-        self._reference_of = reference_of
-        self._require_ready = require_ready
+        self._tracker = tracker
+        self._references = references
+        self._lifecycle = lifecycle
         self._watchers = 0
         self._ended = asyncio.Event()
 
@@ -58,7 +60,7 @@ class ConsistencyPlane:
             TrackingUnavailable: the track memory does not answer.
             Unavailable: not ready.
         """
-        self._require_ready()
+        self._lifecycle.require_ready()
         _check_id("scene_id", request.scene_id)
         _check_id("agent_id", request.agent_id)
         if not 0 <= request.window <= WINDOW:
@@ -69,7 +71,7 @@ class ConsistencyPlane:
 
     async def get_scene(self, request: pb.GetSceneConsistencyRequest) -> pb.GetSceneConsistencyResponse:
         """A scene now. Raises as ``get_agent``."""
-        self._require_ready()
+        self._lifecycle.require_ready()
         _check_id("scene_id", request.scene_id)
         held = await self._read(request.scene_id, SCENE_WINDOW)
         found = await asyncio.to_thread(figures, held.instants.packed)
@@ -80,7 +82,7 @@ class ConsistencyPlane:
         sums.add(found, held.instants.series, newly_only=False)
         return pb.GetSceneConsistencyResponse(
             latest=self._messages(found, held, [newest[key] for key in sorted(newest)]),
-            models=model_messages(sums, self._reference_of),
+            models=model_messages(sums, self._references),
         )
 
     async def list_models(self, request: pb.ListModelConsistencyRequest) -> pb.ListModelConsistencyResponse:
@@ -89,8 +91,8 @@ class ConsistencyPlane:
         Raises:
             Unavailable: not ready.
         """
-        self._require_ready()
-        return pb.ListModelConsistencyResponse(models=model_messages(self._sums(), self._reference_of))
+        self._lifecycle.require_ready()
+        return pb.ListModelConsistencyResponse(models=model_messages(self._tracker.sums(), self._references))
 
     async def reset_scene(self, request: pb.ResetSceneRequest) -> pb.ResetSceneResponse:
         """Forgets a scene.
@@ -98,7 +100,7 @@ class ConsistencyPlane:
         Raises:
             BadField, TrackingUnavailable, Unavailable: as ``get_agent``.
         """
-        self._require_ready()
+        self._lifecycle.require_ready()
         _check_id("scene_id", request.scene_id)
         try:
             agents = await self._guard.run("reset", lambda: self._store.reset(request.scene_id), PATIENCE)
@@ -113,7 +115,7 @@ class ConsistencyPlane:
             BadField, TrackingUnavailable, Unavailable: as ``get_agent``.
             Overloaded: too many watch.
         """
-        self._require_ready()
+        self._lifecycle.require_ready()
         _check_id("scene_id", request.scene_id)
         if self._watchers >= MAX_WATCHERS:
             raise Overloaded(f"{self._watchers} calls watch already", _WATCH_RETRY)
@@ -161,7 +163,7 @@ class ConsistencyPlane:
     def _messages(self, found: Figures, held: Remembered, rows: Sequence[int]) -> list[pb.InstantConsistency]:
         of = held.instants
         ids, series = [of.agent_ids[row] for row in rows], [of.series[row] for row in rows]
-        return instant_messages(found.rows(rows), ids, series, self._reference_of)
+        return instant_messages(found.rows(rows), ids, series, self._references)
 
 
 def _check_id(field: str, value: str) -> None:

@@ -8,8 +8,9 @@ from time import perf_counter
 
 from cab.forecast.v1 import consistency_service_pb2 as pb
 from service.tracking.aggregates import Sums
-from service.tracking.messages import ReferenceOf, instant_messages
+from service.tracking.messages import instant_messages
 from service.tracking.metrics import figures
+from service.tracking.model_references import ModelReferences
 from service.tracking.statuses import OF_AGENT, OF_SCENE
 from service.tracking.store.base import Recalled, Sighting, StoreError, TrackStore
 from service.tracking.store.guard import Guard
@@ -48,7 +49,7 @@ class Tracker:
         guard: of the calls to it that forecasts wait for.
         asking: of the others.
         budget: s that a call waits for the memory.
-        reference_of: a series' model.
+        references: references to models.
     """
 
     def __init__(
@@ -57,14 +58,14 @@ class Tracker:
         guard: Guard,
         asking: Guard,
         budget: float,
-        reference_of: ReferenceOf,
+        references: ModelReferences,
     ) -> None:
         self._sums = Sums()
         self._store = store
         self._guard = guard
         self._asking = asking
         self._budget = budget
-        self._reference_of = reference_of
+        self._references = references
         self._telling: dict[str, asyncio.Task[None]] = {}
         """The last of each scene that is told of something."""
         self._due: list[tuple[str, Recalled]] = []
@@ -143,7 +144,7 @@ class Tracker:
             self._sums.add(found, instants.series, newly_only=True)
         if not (latest or recalled.watched):
             return []
-        messages = instant_messages(found, instants.agent_ids, instants.series, self._reference_of)
+        messages = instant_messages(found, instants.agent_ids, instants.series, self._references)
         if recalled.watched:
             self._tell(scene_id, [message.SerializeToString() for message in messages])
         return messages

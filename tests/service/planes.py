@@ -10,7 +10,7 @@ from google.protobuf.message import Message
 from cab.forecast.v1 import consistency_service_pb2 as pb
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from service.server import Server
-from service.tracking.service import ConsistencyPlane
+from service.tracking.service import ConsistencyService
 
 MODEL = models_pb.ModelReference(name="fake", version="1.0.0", protocol=models_pb.INPUT_PROTOCOL_CAUSAL)
 INSTANT = pb.InstantConsistency(
@@ -43,7 +43,7 @@ MODELS = pb.ListModelConsistencyResponse(models=[SUMS])
 RESET = pb.ResetSceneResponse(agents=7)
 
 
-class FakePlane(ConsistencyPlane):
+class FakePlane(ConsistencyService):
     """Answers as it is told to; watches give what is sent to them, from any thread."""
 
     def __init__(self) -> None:  # the real one's needs are none of the transports' business

@@ -226,7 +226,7 @@ async def test_a_request_that_is_still_coming_was_accepted() -> None:
         head = "POST /v1/predict HTTP/1.1\r\nHost: x\r\nContent-Type: application/x-protobuf\r\n"
         writer.write(f"{head}Content-Length: {len(body)}\r\n\r\n".encode() + body[:10])
         async with asyncio.timeout(10):
-            while not server.dataplane._calls:  # noqa: ASYNC110 - no event tells
+            while not server.dataplane._lifecycle.calls:  # noqa: ASYNC110 - no event tells
                 await asyncio.sleep(0.005)
         stopping = asyncio.create_task(server.stop())
         await asyncio.sleep(0.2)

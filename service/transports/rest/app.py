@@ -11,7 +11,8 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 
 from service.errors import BadField, MethodNotAllowed, NotFound, ServiceError, Unavailable
-from service.predict.pipeline import DataPlane, Phase
+from service.lifecycle import Phase
+from service.predict.pipeline import DataPlane
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
 from service.transports.boundary import to_service_error

@@ -14,7 +14,8 @@ from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.forecaster import Context, Protocol
 from model.scenes.scene import AgentType
 from service.errors import BadField, BadFields, DeadlineExceeded, Overloaded, Unavailable, UnknownModel
-from service.predict.pipeline import DataPlane, Phase
+from service.lifecycle import Phase
+from service.predict.pipeline import DataPlane
 from service.predict.request_decoder import Encoded
 from service.settings import FALLBACK_MODEL, SettingsError
 from service.telemetry.metrics import Metrics
