@@ -6,10 +6,11 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
 from matplotlib.transforms import Affine2D
 
+from cab.forecast.v1.bounds import PATCH_PIXELS
 from cab.forecast.v1.prediction_service_pb2 import Agent, PredictRequest
 from cab_forecast.layers import Layers, decode_layers
 from cab_forecast.plot_style import DRIVEABLE, LANE_DIVIDER, ROAD_DIVIDER
-from cab_forecast.requests import PATCH_PIXELS, PIXELS_PER_METER
+from cab_forecast.requests import PIXELS_PER_METER
 
 _PATCH_ORIGIN = (-10 / PIXELS_PER_METER, -50 / PIXELS_PER_METER)
 """Where a patch's first pixel is, m ahead of and to the left of the agent."""

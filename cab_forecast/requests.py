@@ -11,6 +11,7 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
+from cab.forecast.v1.bounds import PATCH_PIXELS
 from cab.forecast.v1.model_service_pb2 import AgentType
 from cab.forecast.v1.prediction_service_pb2 import (
     CONTEXT_BLIND,
@@ -29,8 +30,6 @@ from cab_forecast.layers import ImageEncoding, as_layers, encode_layers
 TypeName = Literal["vehicle", "pedestrian", "cyclist", "unknown"]
 History = Literal["request", "memory"]
 
-PATCH_PIXELS = 100
-"""Rows and columns of an agent's own map patches, the near and the far one."""
 PIXELS_PER_METER = 3.0
 """Resolution of a near patch; a raster of the same loses nothing when the server cuts patches from it."""
 

@@ -9,6 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
+from cab.forecast.v1.bounds import MAX_ID_LENGTH
+
 DOMAIN = "cab-forecast"
 """Domain of google.rpc.ErrorInfo, and the namespace of the problem types."""
 
@@ -20,6 +22,11 @@ class Fault:
     field: str
     """Path in the request, e.g. "agents[3].states[1].x"."""
     detail: str
+
+
+def id_too_long(an_id: str) -> str:
+    """Return the detail of the fault of an id that is longer than the contract allows."""
+    return f"has {len(an_id)} characters; at most {MAX_ID_LENGTH}"
 
 
 class ServiceError(Exception):

@@ -16,18 +16,14 @@ from google.protobuf.descriptor import FieldDescriptor
 
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
+from cab.forecast.v1.bounds import FIELD_BOUNDS, MAX_ID_LENGTH, PATCH_PIXELS
 from model.arrays import Bools, Bytes, Float32s, Floats, Ints
 from model.scenes.observations import JUMP_SLACK, MAX_SPEED, Observations
 from model.scenes.resample import MAX_AGE, TIME_TOLERANCE
 from model.scenes.scene import AgentType
-from service.errors import BadField, Fault
-from service.limits import too_long
+from service.errors import BadField, Fault, id_too_long
 from service.predict.images import decode_layers
-from service.predict.options import MAX_POSITION, MAX_TIME
 from service.settings import Settings
-
-PATCH_PIXELS = 100
-"""Rows and columns of an agent's own map patches, the near and the far one."""
 
 _PatchName = Literal["map_patch", "far_map_patch"]
 _PATCH_NAMES: tuple[_PatchName, ...] = get_args(_PatchName)
@@ -43,11 +39,11 @@ _FIELDS = [field.name for field in pb.AgentState.DESCRIPTOR.fields]
 _TIME, _X, _Y, _HEADING, _VX, _VY, _AX, _AY, _RATE = range(9)
 _REQUIRED = [_TIME, _X, _Y]
 _PAIRS = [(_VX, _VY), (_AX, _AY)]
-_BOUNDS = np.array([MAX_TIME, MAX_POSITION, MAX_POSITION, 1e4, 150.0, 150.0, 100.0, 100.0, 20.0])
+_BOUNDS = np.array([FIELD_BOUNDS[f"AgentState.{name}"][1] for name in _FIELDS])  # either way
 _FIXED64 = 1  # wire type
 _TAG_BYTES = np.array([field.number << 3 | _FIXED64 for field in pb.AgentState.DESCRIPTOR.fields])
 _DOUBLE_BYTES = 9  # tag and value
-if len(_FIELDS) != len(_BOUNDS) or any(
+if len(_FIELDS) != _RATE + 1 or any(
     field.type != FieldDescriptor.TYPE_DOUBLE or field.number != index + 1
     for index, field in enumerate(pb.AgentState.DESCRIPTOR.fields)
 ):
@@ -142,8 +138,8 @@ def _head_faults(request: pb.PredictRequest, ids: Sequence[str], settings: Setti
         here = f"agents[{index}]"
         if not agent_id:
             faults[index] = Fault(f"{here}.id", "is required")
-        elif (fault := too_long(agent_id)) is not None:
-            faults[index] = Fault(f"{here}.id", fault)
+        elif len(agent_id) > MAX_ID_LENGTH:
+            faults[index] = Fault(f"{here}.id", id_too_long(agent_id))
         elif uses[agent_id] > 1:
             faults[index] = Fault(f"{here}.id", f"{uses[agent_id]} agents share it")
         elif agent.type == models_pb.AGENT_TYPE_UNSPECIFIED:

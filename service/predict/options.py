@@ -2,27 +2,25 @@
 
 import math
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
+from cab.forecast.v1.bounds import FIELD_BOUNDS, MAX_ID_LENGTH, STEP_SECONDS
 from model.forecaster import Context, ModelInfo
-from model.scenes.scene import STEP_SECONDS, Raster
-from service.errors import BadField, TooLarge
-from service.limits import too_long
+from model.scenes.scene import Raster
+from service.errors import BadField, TooLarge, id_too_long
 from service.predict.images import decode_layers
 from service.settings import Settings
 
-MAX_TIME = 1e10
-"""s since the epoch, either way."""
-MAX_POSITION = 1e7
-"""m from the origin, either way."""
-_PIXELS_PER_METER = (0.1, 100.0)
 _CONTEXTS = {
     pb.CONTEXT_UNSPECIFIED: Context.FULL,
     pb.CONTEXT_FULL: Context.FULL,
     pb.CONTEXT_BLIND: Context.BLIND,
 }
+_RasterNumber = Literal["origin_x", "origin_y", "pixels_per_meter"]
+_RASTER_NUMBERS: tuple[_RasterNumber, ...] = get_args(_RasterNumber)
 _RECALLS = {
     pb.HISTORY_SOURCE_UNSPECIFIED: False,
     pb.HISTORY_SOURCE_REQUEST: False,
@@ -69,11 +67,11 @@ def read_options(request: pb.PredictRequest, info: ModelInfo, settings: Settings
     """
     if len(request.agents) > settings.max_agents:
         raise TooLarge(f"{len(request.agents)} agents; at most {settings.max_agents} are accepted")
-    if (fault := too_long(request.scene_id)) is not None:
-        raise BadField("scene_id", fault)
+    if len(request.scene_id) > MAX_ID_LENGTH:
+        raise BadField("scene_id", id_too_long(request.scene_id))
     if not request.HasField("time"):
         raise BadField("time", "is required")
-    _check_number("time", request.time, -MAX_TIME, MAX_TIME)
+    _check_number("time", request.time, *FIELD_BOUNDS["PredictRequest.time"])
 
     options = request.options
     context = _CONTEXTS.get(options.context)
@@ -120,14 +118,12 @@ def read_raster(request: pb.PredictRequest, settings: Settings) -> Raster | None
     if not request.HasField("scene_raster"):
         return None
     raster = request.scene_raster
-    for name, low, high in (
-        ("origin_x", -MAX_POSITION, MAX_POSITION),
-        ("origin_y", -MAX_POSITION, MAX_POSITION),
-        ("pixels_per_meter", *_PIXELS_PER_METER),
-    ):
-        if not raster.HasField(name):  # type: ignore[arg-type]  # one of three literals
-            raise BadField(f"scene_raster.{name}", "is required")
-        _check_number(f"scene_raster.{name}", getattr(raster, name), low, high)
+    for number in _RASTER_NUMBERS:
+        if not raster.HasField(number):
+            raise BadField(f"scene_raster.{number}", "is required")
+        _check_number(
+            f"scene_raster.{number}", getattr(raster, number), *FIELD_BOUNDS[f"SceneRaster.{number}"]
+        )
     if raster.image.WhichOneof("encoding") == "packed_bits":
         for name, size in (("rows", raster.rows), ("columns", raster.columns)):
             if size == 0:

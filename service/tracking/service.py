@@ -4,9 +4,9 @@ import asyncio
 from collections.abc import AsyncIterator, Sequence
 
 from cab.forecast.v1 import consistency_service_pb2 as pb
-from service.errors import BadField, Overloaded, TrackingUnavailable, UnknownTrack
+from cab.forecast.v1.bounds import MAX_ID_LENGTH
+from service.errors import BadField, Overloaded, TrackingUnavailable, UnknownTrack, id_too_long
 from service.lifecycle import Lifecycle
-from service.limits import too_long
 from service.tracking.aggregates import Sums
 from service.tracking.messages import instant_messages, model_messages
 from service.tracking.metrics import Figures, figures
@@ -169,5 +169,5 @@ class ConsistencyService:
 def _check_id(field: str, value: str) -> None:
     if not value:
         raise BadField(field, "is required")
-    if (fault := too_long(value)) is not None:
-        raise BadField(field, fault)
+    if len(value) > MAX_ID_LENGTH:
+        raise BadField(field, id_too_long(value))

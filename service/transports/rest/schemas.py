@@ -8,8 +8,7 @@ from google.protobuf.descriptor import Descriptor, EnumDescriptor, FieldDescript
 from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
-from service.limits import MAX_ID_LENGTH
-from service.predict.options import MAX_POSITION, MAX_TIME
+from cab.forecast.v1.bounds import FIELD_BOUNDS, MAX_ID_LENGTH, STEP_SECONDS
 from service.settings import Settings
 from service.tracking.store.base import WINDOW
 from service.transports.rest.comments import comments
@@ -54,33 +53,17 @@ REQUIRED = {
 
 def bounds(settings: Settings) -> dict[str, Schema]:
     """Limits of the request's fields by "Message.field"."""
-
-    def within(limit: float) -> Schema:
-        return {"minimum": -limit, "maximum": limit}
-
     an_id = {"minLength": 1, "maxLength": MAX_ID_LENGTH}
-    return {
+    numbers = {name: {"minimum": low, "maximum": high} for name, (low, high) in FIELD_BOUNDS.items()}
+    return numbers | {
         "PredictRequest.scene_id": {"maxLength": MAX_ID_LENGTH},
-        "PredictRequest.time": within(MAX_TIME),
         "PredictRequest.agents": {"maxItems": settings.max_agents},
         "Agent.id": an_id,
         "Agent.states": {"minItems": 1, "maxItems": settings.max_states},
-        "AgentState.time": within(MAX_TIME),
-        "AgentState.x": within(MAX_POSITION),
-        "AgentState.y": within(MAX_POSITION),
-        "AgentState.heading": within(1e4),
-        "AgentState.velocity_x": within(150.0),
-        "AgentState.velocity_y": within(150.0),
-        "AgentState.acceleration_x": within(100.0),
-        "AgentState.acceleration_y": within(100.0),
-        "AgentState.heading_rate": within(20.0),
         "SceneRaster.rows": {"maximum": settings.max_raster_pixels},
         "SceneRaster.columns": {"maximum": settings.max_raster_pixels},
-        "SceneRaster.origin_x": within(MAX_POSITION),
-        "SceneRaster.origin_y": within(MAX_POSITION),
-        "SceneRaster.pixels_per_meter": {"minimum": 0.1, "maximum": 100.0},
         "PredictOptions.samples": {"maximum": settings.max_samples},
-        "PredictOptions.horizon": {"minimum": 0.5, "multipleOf": 0.5},
+        "PredictOptions.horizon": {"minimum": STEP_SECONDS, "multipleOf": STEP_SECONDS},
         "GetAgentConsistencyRequest.scene_id": an_id,
         "GetAgentConsistencyRequest.agent_id": an_id,
         "GetAgentConsistencyRequest.window": {"minimum": 0, "maximum": WINDOW},
