@@ -9,7 +9,7 @@ PIP_FLAGS ?=
 PROTOC := PATH="$(CURDIR)/$(BIN):$$PATH" python -m grpc_tools.protoc
 PROTOS := $(wildcard proto/cab/forecast/v1/*.proto)
 
-.PHONY: install run test test-nuscenes bench faults lint format proto proto-check proto-lint lock clean
+.PHONY: install run test test-nuscenes bench faults lint format docs proto proto-check proto-lint lock clean
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -53,6 +53,9 @@ bench: install  ## speed of the forward against this process's own matmul rate; 
 
 faults: install  ## forecasts while the track memory is killed, full, slow and hanging; needs redis-server
 	$(BIN)/python -m loadtest.faults
+
+docs: install  ## renew the generated parts of docs/: settings, tables of figures
+	$(BIN)/python -m docs.generate
 
 proto: install  ## generate Python from proto/
 	$(PROTOC) -Iproto --python_out=proto --mypy_out=proto --grpc_python_out=proto \

@@ -84,7 +84,9 @@ class Settings(BaseSettings):
     """Threads of the forward; None: the physical cores."""
 
     log_level: Literal["debug", "info", "warning", "error"] = "info"
+    """Least severe level that is logged."""
     log_json: bool = False
+    """Logs as JSON lines."""
 
     @field_validator("http", "grpc")
     @classmethod

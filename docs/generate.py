@@ -1,0 +1,252 @@
+"""The generated parts of the documentation: ``make docs``, or ``python -m docs.generate``.
+
+A page marks each generated part with ``<!-- generated: NAME -->`` and ``<!-- end of NAME -->``. Everything
+between the two is written from the code or the data file; the rest of the page is written by hand.
+"""
+
+import ast
+import inspect
+import json
+import re
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, get_args
+
+import annotated_types
+import typer
+from pydantic.fields import FieldInfo
+
+from cli.main import app
+from service.environment import PREFIX
+from service.settings import Settings
+
+DOCS = Path(__file__).resolve().parent
+BENCHMARK = DOCS / "data/benchmark_train_val.json"
+"""Benchmark figures of the bundled checkpoints on nuScenes train_val."""
+
+Row = dict[str, Any]
+
+
+def render(page: str) -> str:
+    """Return the text of a page with its generated parts renewed.
+
+    Args:
+        page: file name of the page in ``docs/``.
+
+    Raises:
+        ValueError: the page lacks a marker.
+    """
+    text = (DOCS / page).read_text(encoding="utf-8")
+    for name, make in PAGES[page].items():
+        begin, end = f"<!-- generated: {name} -->", f"<!-- end of {name} -->"
+        part = re.compile(f"{re.escape(begin)}.*?{re.escape(end)}", re.DOTALL)
+        if len(part.findall(text)) != 1:
+            raise ValueError(f'docs/{page} must hold "{begin}" and "{end}" once')
+        filled = f"{begin}\n\n{make()}\n\n{end}"
+        text = part.sub(lambda _, filled=filled: filled, text)  # type: ignore[misc]
+    return text
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a Markdown table without a line end after the last row."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(("|" + "|".join(line) + "|") if line[0] == "---" else _line(line) for line in lines)
+
+
+def settings_table() -> str:
+    """Return one row for each setting: variable, flag of ``serve``, default, range and meaning."""
+    meanings = attribute_docstrings(Settings)
+    flags = serve_flags()
+    return table(
+        ["Variable", "Flag of `serve`", "Default", "Allowed", "Meaning"],
+        [
+            [
+                f"`{PREFIX}{name.upper()}`",
+                f"`{flags[name]}`" if name in flags else "",
+                _default(field),
+                _allowed(field),
+                meanings[name],
+            ]
+            for name, field in Settings.model_fields.items()
+        ],
+    )
+
+
+def attribute_docstrings(cls: type) -> dict[str, str]:
+    """Return the docstring of each annotated attribute of a class, on one line and as Markdown."""
+    [definition] = ast.parse(inspect.getsource(cls)).body
+    assert isinstance(definition, ast.ClassDef)  # noqa: S101 - the source of a class is a class
+    found = {}
+    for before, after in zip(definition.body, definition.body[1:], strict=False):
+        if isinstance(before, ast.AnnAssign) and isinstance(before.target, ast.Name):
+            match after:
+                case ast.Expr(value=ast.Constant(value=str(text))):
+                    line = " ".join(text.split()).replace("``", "`").replace("|", "\\|")
+                    found[before.target.id] = re.sub(r"\bNone: ", "not set: ", line)
+    return found
+
+
+def serve_flags() -> dict[str, str]:
+    """Return the long flag of each parameter of ``cab-forecast serve``."""
+    serve = typer.main.get_group(app).commands["serve"]
+    return {
+        parameter.name: next(flag for flag in parameter.opts if flag.startswith("--"))
+        for parameter in serve.params
+        if parameter.name is not None
+    }
+
+
+def displacement_table(key: str) -> str:
+    """Return the table of displacement errors of one protocol."""
+    return table(
+        [
+            "model",
+            "ADE @1 … 6 s",
+            "FDE @1 … 6 s",
+            "OffR",
+            "NLL",
+            "minADE₁₀",
+            "in 50 / 90 / 99 %",
+            "FDE-f",
+            "OffR-f",
+        ],
+        [
+            [
+                row["model"],
+                " ".join(map(_two, row["ade"])),
+                " ".join(map(_two, row["fde"])),
+                _two(row["off_road"]),
+                _two(row["nll"]),
+                _two(row["min_ade_10"]),
+                _slashed(row["inside_50_90_99"], str),
+                _two(row["sampled_fde"]),
+                _two(row["sampled_off_road"]),
+            ]
+            for row in benchmark(key)
+        ],
+    )
+
+
+def merged_table() -> str:
+    """Return the table of merged modes; in brackets the figures without agents that stood."""
+    return table(
+        [
+            "model",
+            "FDE",
+            "FDE, merged",
+            "minADE₅ / ₁₀",
+            "minADE₅ / ₁₀, merged",
+            "miss rate₅",
+            "miss rate₅, merged",
+            "brier-minFDE₅, merged",
+            "merged modes for 90 %",
+            "first weight",
+            "NLL",
+            "in 90 %",
+        ],
+        [
+            [
+                row["model"],
+                _bracketed(row["fde"], _two),
+                _bracketed(row["fde_merged"], _two),
+                _slashed(row["min_ade_5_10"], _two),
+                _slashed(row["min_ade_5_10_merged"], _two),
+                _two(row["miss_rate_5"]),
+                _two(row["miss_rate_5_merged"]),
+                _two(row["brier_min_fde_5_merged"]),
+                _two(row["merged_modes_for_90"]),
+                _two(row["first_weight"]),
+                _bracketed(row["nll"], _two),
+                _bracketed(row["inside_90"], "{} %".format),
+            ]
+            for row in benchmark("merged_causal")
+        ],
+    )
+
+
+def consistency_table() -> str:
+    """Return the table of dispersion, convergence-to-range and the hardest pairs."""
+    return table(
+        ["model", "D, std", "D, mean", "D, rms", "C(0.2 m)", "C(1 m)", "C(5 m)", "hardest 1 / 2 / 3 %"],
+        [
+            [
+                row["model"],
+                *(_two(row[f"dispersion_{kind}"]) for kind in ("std", "mean", "rms")),
+                *(_two(row[f"convergence_{range_}"]) for range_ in ("02", "1", "5")),
+                _slashed(row["hardest_fde_1_2_3"], "{:.1f}".format),
+            ]
+            for row in benchmark("consistency_causal")
+        ],
+    )
+
+
+def benchmark(key: str) -> list[Row]:
+    """Return the rows of one table of the benchmark figures."""
+    rows: list[Row] = json.loads(BENCHMARK.read_text(encoding="utf-8"))[key]
+    return rows
+
+
+PAGES: dict[str, dict[str, Callable[[], str]]] = {
+    "settings.md": {"settings": settings_table},
+    "models.md": {
+        "displacement_causal": lambda: displacement_table("displacement_causal"),
+        "merged_causal": merged_table,
+        "consistency_causal": consistency_table,
+        "displacement_paper": lambda: displacement_table("displacement_paper"),
+    },
+}
+"""Functions that write the generated parts, by page and name."""
+
+
+def main() -> None:
+    """Renew the generated parts of all pages."""
+    for page in PAGES:
+        (DOCS / page).write_text(render(page), encoding="utf-8")
+
+
+def _default(field: FieldInfo) -> str:
+    match field.get_default():
+        case None | ():
+            return "not set"
+        case bool() as switch:
+            return f"`{str(switch).lower()}`"
+        case float() as number:
+            return f"`{number:.15g}`"
+        case value:
+            return f"`{value}`"
+
+
+def _allowed(field: FieldInfo) -> str:
+    bounds = []
+    for limit in field.metadata:
+        match limit:
+            case annotated_types.Gt(gt=bound):
+                bounds.append(f"> {bound:.15g}")
+            case annotated_types.Ge(ge=bound):
+                bounds.append(f"≥ {bound:.15g}")
+    if bounds:
+        return ", ".join(bounds)
+    choices = [choice for choice in get_args(field.annotation) if isinstance(choice, str)]
+    return ", ".join(f"`{choice}`" for choice in choices)
+
+
+def _line(cells: Sequence[str]) -> str:
+    return "|" + "|".join(f" {cell} " if cell else " " for cell in cells) + "|"
+
+
+def _two(value: float | None) -> str:
+    return "–" if value is None else f"{value:.2f}"
+
+
+def _slashed(values: Sequence[float] | None, form: Callable[[Any], str]) -> str:
+    return "–" if values is None else " / ".join(map(form, values))
+
+
+def _bracketed(values: Sequence[float], form: Callable[[Any], str]) -> str:
+    """Return "all (without agents that stood)"."""
+    every, moving = values
+    return f"{form(every)} ({form(moving)})"
+
+
+if __name__ == "__main__":
+    main()
