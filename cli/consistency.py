@@ -1,20 +1,21 @@
-# ruff: noqa: PLC0415 - imports are inside, as in all commands: --help must not wait for them
-"""``cab-forecast consistency``: how stable and how right a server's forecasts were."""
+# ruff: noqa: PLC0415 - imports stand in functions, so that --help does not wait for them
+"""``cab-forecast consistency``: stability and accuracy of the forecasts that a server remembers."""
 
+from contextlib import suppress
 from typing import Annotated
 
 import typer
 
 from cab_forecast.endpoints import DEFAULT_ENDPOINT
-from cli.options import DEFAULT_TIMEOUT, AsJson, Endpoint, Timeout, Token
+from cli.connection import DEFAULT_TIMEOUT, AsJson, Connection, Endpoint, Timeout, Token, connect
 
 Scene = Annotated[str, typer.Argument(metavar="SCENE", help="The scene_id of the requests.")]
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the commands."""
+    """Add the commands."""
     group = typer.Typer(
-        help="How stable and how right forecasts were, from what a server remembers.", no_args_is_help=True
+        help="Show how stable and how accurate a server's recent forecasts were.", no_args_is_help=True
     )
     for command in (models, scene, agent, watch, reset):
         group.command()(command)
@@ -28,11 +29,17 @@ def models(
     timeout: Timeout = DEFAULT_TIMEOUT,
     as_json: AsJson = False,
 ) -> None:
-    """Show what was settled of each model since the server started."""
-    from cli.asking import Server
-    from cli.consistencies import show_models
+    """Show each model's metrics since the server started."""
+    from cab.forecast.v1.consistency_service_pb2 import ListModelConsistencyResponse
+    from cab_forecast.show_consistency import print_models
+    from cli.messages import to_json
 
-    show_models(Server(endpoint, token, timeout), as_json)
+    with connect(Connection(endpoint, token, timeout)) as client:
+        listed = client.model_consistency()
+    if as_json:
+        typer.echo(to_json(ListModelConsistencyResponse(models=listed)))
+    else:
+        print_models(listed)
 
 
 def scene(
@@ -43,11 +50,16 @@ def scene(
     timeout: Timeout = DEFAULT_TIMEOUT,
     as_json: AsJson = False,
 ) -> None:
-    """Show the newest observation of every agent of a scene, and sums by model."""
-    from cli.asking import Server
-    from cli.consistencies import show_scene
+    """Show the latest observation of every agent of a scene, and sums by model."""
+    from cab_forecast.show_consistency import print_scene
+    from cli.messages import to_json
 
-    show_scene(Server(endpoint, token, timeout), scene_id, as_json)
+    with connect(Connection(endpoint, token, timeout)) as client:
+        response = client.scene_consistency(scene_id)
+    if as_json:
+        typer.echo(to_json(response))
+    else:
+        print_scene(response)
 
 
 def agent(
@@ -55,18 +67,24 @@ def agent(
     agent_id: Annotated[str, typer.Argument(metavar="AGENT", help="The agent's id in the requests.")],
     *,
     window: Annotated[
-        float | None, typer.Option(help="Seconds back from its newest observation. [default: 2]")
+        float | None, typer.Option(help="Seconds back from the agent's latest observation. [default: 2]")
     ] = None,
     endpoint: Endpoint = DEFAULT_ENDPOINT,
     token: Token = None,
     timeout: Timeout = DEFAULT_TIMEOUT,
     as_json: AsJson = False,
 ) -> None:
-    """Show an agent's last observations, and what was forecast for them."""
-    from cli.asking import Server
-    from cli.consistencies import show_agent
+    """Show an agent's latest observations, and what was forecast for them."""
+    from cab.forecast.v1.consistency_service_pb2 import GetAgentConsistencyResponse
+    from cab_forecast.show_consistency import print_instants
+    from cli.messages import to_json
 
-    show_agent(Server(endpoint, token, timeout), scene_id, agent_id, window, as_json)
+    with connect(Connection(endpoint, token, timeout)) as client:
+        instants = client.agent_consistency(scene_id, agent_id, window)
+    if as_json:
+        typer.echo(to_json(GetAgentConsistencyResponse(instants=instants)))
+    else:
+        print_instants(instants)
 
 
 def watch(
@@ -77,11 +95,18 @@ def watch(
     timeout: Timeout = DEFAULT_TIMEOUT,
     as_json: AsJson = False,
 ) -> None:
-    """Print what is found out about a scene as it comes, until Ctrl-C or the server's end."""
-    from cli.asking import Server
-    from cli.consistencies import show_events
+    """Print a scene's metrics as they are settled, until Ctrl-C or until the server ends the stream."""
+    from cab_forecast.show_consistency import print_event
+    from cli.messages import to_json
 
-    show_events(Server(endpoint, token, timeout), scene_id, as_json)
+    connection = Connection(endpoint, token, timeout)
+    with suppress(KeyboardInterrupt), connect(connection) as client, client.watch_scene(scene_id) as events:
+        for event in events:
+            if as_json:
+                typer.echo(to_json(event))
+            else:
+                print_event(event)
+        typer.echo("the server ended the watch", err=True)
 
 
 def reset(
@@ -93,7 +118,12 @@ def reset(
     as_json: AsJson = False,
 ) -> None:
     """Make the server forget a scene."""
-    from cli.asking import Server
-    from cli.consistencies import reset_scene
+    from cab.forecast.v1.consistency_service_pb2 import ResetSceneResponse
+    from cli.messages import to_json
 
-    reset_scene(Server(endpoint, token, timeout), scene_id, as_json)
+    with connect(Connection(endpoint, token, timeout)) as client:
+        agents = client.reset_scene(scene_id)
+    if as_json:
+        typer.echo(to_json(ResetSceneResponse(agents=agents)))
+    else:
+        typer.echo(f"forgot {agents} agents" if agents else "there was nothing to forget")

@@ -1,46 +1,53 @@
-"""``cab-forecast evaluate``."""
+"""``cab-forecast evaluate``: models on a data set's split, without a server."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from cli.failures import fail
 
+if TYPE_CHECKING:
+    from model.evaluation.results import Results
+    from model.evaluation.run import Evaluation
+
 
 def register(app: typer.Typer) -> None:
-    """Adds the command."""
+    """Add the command."""
     app.command("evaluate")(evaluate)
 
 
 def evaluate(
     data: Annotated[str, typer.Option(help="KIND:PATH of the data, e.g. nuscenes_pred:DIR")],
     out: Annotated[Path, typer.Option(file_okay=False, help="Folder for results.json and tables.md.")],
-    split: Annotated[str, typer.Option(help="Split to judge on.")] = "train_val",
+    split: Annotated[str, typer.Option(help="Split to evaluate on.")] = "train_val",
     protocol: Annotated[
-        str, typer.Option(help="causal, or paper to compare with tables; of the inputs and the checkpoints")
+        str,
+        typer.Option(
+            help="Protocol of inputs and checkpoints: causal, or paper to compare with published tables."
+        ),
     ] = "causal",
     models: Annotated[
         Path | None, typer.Option(help="Folder of checkpoints. [default: the bundled ones]")
     ] = None,
     only: Annotated[
-        str | None, typer.Option(help="NAME,… of checkpoints, baselines, physics-oracle. [default: all]")
+        str | None,
+        typer.Option(help="NAME,… of checkpoints, baselines or physics-oracle. [default: all]"),
     ] = None,
     ablate: Annotated[
         bool,
-        typer.Option("--ablate", help="Also judge checkpoints with the map, the neighbours, both gone."),
+        typer.Option("--ablate", help="Also evaluate without the map, without neighbours, without both."),
     ] = False,
     samples: Annotated[
-        int, typer.Option(min=0, help="Trajectories drawn a pair; 0: none, and no calibration.")
+        int, typer.Option(min=0, help="Sampled trajectories per pair; 0: none, and no calibration.")
     ] = 200,
-    limit: Annotated[int | None, typer.Option(min=1, help="Only so many of the first pairs.")] = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="Evaluate the first LIMIT pairs only.")] = None,
     cache: Annotated[
-        Path | None, typer.Option(help="Folder of caches, as train's. [default: OUT/cache]")
+        Path | None, typer.Option(help="Folder of cached features, shared with train. [default: OUT/cache]")
     ] = None,
 ) -> None:
-    """Judges checkpoints beside physics and Kalman on every challenge pair of a split, without a server."""
-    from cli.evaluation import show_evaluation  # noqa: PLC0415
-    from cli.tables import show_tables  # noqa: PLC0415
+    """Evaluate checkpoints, physics models and the Kalman filter on every challenge pair of a split."""
+    from cli.display import show_tables  # noqa: PLC0415
     from model.checkpoint import CheckpointError  # noqa: PLC0415 (torch is slow to import)
     from model.data.scenes import DataError  # noqa: PLC0415
     from model.data.sources import READERS, parse_data, parse_protocol  # noqa: PLC0415
@@ -60,8 +67,24 @@ def evaluate(
         evaluation = Evaluation(
             subjects, kind, reader, split, inputs, cache or out / "cache", samples, limit, ablate
         )
-        results = show_evaluation(evaluation)
+        results = _run(evaluation)
         write_results(results, out)
     except (DataError, CheckpointError, EvaluationError, OSError) as error:
         fail(str(error))
     show_tables(tables(results), out)
+
+
+def _run(evaluation: "Evaluation") -> "Results":
+    """Run the evaluation and show its progress."""
+    from rich.console import Console  # noqa: PLC0415
+
+    from cli.display import count_up  # noqa: PLC0415
+
+    console = Console(stderr=True)
+    with count_up(console) as bar:
+        task = bar.add_task("starting", total=None)
+
+        def tick(what: str, done: int) -> None:
+            bar.update(task, description=f"{what}: {done} pairs")
+
+        return evaluation(tick, console.print)

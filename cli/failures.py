@@ -1,4 +1,4 @@
-"""How a command ends that cannot do its work: one line, and no traceback."""
+"""One-line errors of commands."""
 
 from typing import NoReturn
 
@@ -6,7 +6,7 @@ import typer
 
 
 def fail(message: str) -> NoReturn:
-    """Prints the message to standard error and ends the command.
+    """Print the message to standard error on one line and end the command.
 
     Raises:
         typer.Exit: always, with code 1.

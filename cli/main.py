@@ -1,4 +1,4 @@
-"""``cab-forecast``: its commands, and nothing heavy before one of them runs."""
+"""The program ``cab-forecast``: its options and commands."""
 
 from importlib.metadata import version
 from typing import Annotated
@@ -27,7 +27,7 @@ def _options(
         bool, typer.Option("--version", help="Print the version.", callback=_print_version, is_eager=True)
     ] = False,
 ) -> None:
-    """Options of the whole program."""
+    """Declare the options of the whole program."""
 
 
 serve.register(app)

@@ -1,4 +1,4 @@
-"""Messages of the contract in files: protobuf JSON or binary protobuf."""
+"""Files of contract messages: protobuf JSON or binary protobuf."""
 
 import sys
 from pathlib import Path
@@ -14,12 +14,12 @@ _BINARY, _JSON = ".binpb", ".json"
 
 
 def read_message(source: str, message: AnyMessage) -> AnyMessage:
-    """Fills a message from a file.
+    """Read a message from a file.
 
     Args:
-        source: ``*.binpb`` is binary, ``*.json`` JSON; of others, and of ``-`` for standard input, the first
-            character tells.
-        message: an empty one.
+        source: path; ``*.binpb`` is binary and ``*.json`` JSON; the first character decides for other names
+            and for ``-``, standard input.
+        message: an empty message, which is filled and returned.
 
     Raises:
         OSError: the file cannot be read.
@@ -37,7 +37,7 @@ def read_message(source: str, message: AnyMessage) -> AnyMessage:
 
 
 def write_message(path: Path, message: Message) -> None:
-    """Writes a message, as binary protobuf where the name ends in ``.binpb``, else as JSON.
+    """Write a message: binary protobuf where the name ends in ``.binpb``, JSON otherwise.
 
     Raises:
         OSError: the file cannot be written.
@@ -49,5 +49,5 @@ def write_message(path: Path, message: Message) -> None:
 
 
 def to_json(message: Message) -> str:
-    """Protobuf JSON with the contract's own field names, on one line."""
+    """Return protobuf JSON on one line, with the contract's field names."""
     return json_format.MessageToJson(message, preserving_proto_field_name=True, indent=None)

@@ -1,4 +1,4 @@
-"""``cab-forecast serve``."""
+"""``cab-forecast serve``: the server, until it is told to stop."""
 
 import asyncio
 import gc
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the command to the program."""
+    """Add the command."""
     app.command("serve")(serve)
 
 
@@ -25,7 +25,7 @@ def serve(
     store: Annotated[
         str | None,
         typer.Option(
-            help="Where agents are remembered: memory, redis://…, redis+sentinel://…, redis+cluster://… "
+            help="Track memory: memory (this process), redis://…, redis+sentinel://… or redis+cluster://… "
             "[default: memory]"
         ),
     ] = None,
@@ -34,13 +34,13 @@ def serve(
     ] = None,
     default_model: Annotated[
         str | None,
-        typer.Option(help="Model of requests that name none. [default: cab if loaded, else kalman]"),
+        typer.Option(help="Model for requests that name none. [default: cab if loaded, else kalman]"),
     ] = None,
     allow_paper_protocol: Annotated[
         bool | None,
         typer.Option(
             "--allow-paper-protocol",
-            help="Load models trained by the paper protocol, too (they warn in every answer).",
+            help="Also load models trained with the paper protocol (they warn in every response).",
         ),
     ] = None,
     config: Annotated[
@@ -49,17 +49,17 @@ def serve(
     log_level: Annotated[
         str | None, typer.Option(help="debug, info, warning or error. [default: info]")
     ] = None,
-    log_json: Annotated[bool | None, typer.Option(help="Logs as JSON lines. [default: for people]")] = None,
+    log_json: Annotated[bool | None, typer.Option(help="Log JSON lines. [default: text]")] = None,
     demo: Annotated[
-        bool, typer.Option("--demo", help="Once ready, forecast the bundled scene through gRPC and print it.")
+        bool, typer.Option("--demo", help="Once ready, forecast the bundled crossing over gRPC and print it.")
     ] = False,
 ) -> None:
-    """Serves forecasts over gRPC and REST until SIGTERM or SIGINT.
+    """Serve forecasts over gRPC and REST until SIGTERM or SIGINT.
 
-    Every setting is an environment variable, too: FORECAST_HTTP, FORECAST_API_TOKENS and so on. Flags go
-    before the environment, and the environment before the file.
+    Every setting is also an environment variable: FORECAST_HTTP, FORECAST_API_TOKENS and so on. Flags
+    override the environment, and the environment overrides the file.
     """
-    from service.settings import SettingsError, load  # noqa: PLC0415 - heavy, and other commands do without
+    from service.settings import SettingsError, load  # noqa: PLC0415 (slow to import)
 
     try:
         settings = load(
@@ -96,7 +96,7 @@ def _serve(settings: "Settings", demo: bool) -> None:
 
 
 def _when_ready(server: "Server", demo: bool) -> None:
-    # What is there now stays: to look through it again and again for garbage would cost calls their time
+    # Everything allocated so far lives until the end; exempt it from garbage collection, which delays calls
     gc.collect()
     gc.freeze()
     if demo:
@@ -104,7 +104,7 @@ def _when_ready(server: "Server", demo: bool) -> None:
 
 
 def _loop_factory() -> "type[asyncio.AbstractEventLoop] | None":
-    """uvloop where it is there: it is quicker, and not made for every platform."""
+    """Return uvloop's loop, or None for asyncio's own on platforms that uvloop does not support."""
     try:
         import uvloop  # noqa: PLC0415
     except ImportError:
@@ -113,7 +113,7 @@ def _loop_factory() -> "type[asyncio.AbstractEventLoop] | None":
 
 
 def _show_demo(server: "Server") -> None:
-    """Forecasts the bundled scene as any client would, and prints it."""
+    """Forecast the bundled crossing through the public client and print it."""
     from cab_forecast import Client, ForecastError  # noqa: PLC0415
     from cab_forecast.demo import demo_request  # noqa: PLC0415
     from cab_forecast.show import print_forecasts  # noqa: PLC0415

@@ -1,82 +1,134 @@
-"""``cab-forecast train``."""
+"""``cab-forecast train``: one training run, resumable."""
 
+import os
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from cli.failures import fail
 
+if TYPE_CHECKING:
+    from model.training.run import Run
+    from model.training.state import Progress
+
 
 def register(app: typer.Typer) -> None:
-    """Adds the command."""
+    """Add the command."""
+    app.command("train")(train)
 
-    @app.command()
-    def train(
-        method: Annotated[
-            str,
-            typer.Argument(
-                help="cab, trajectron, trajectron-no-context, reweight, rubiz, halentnet, "
-                "halentnet-no-context or covernet"
-            ),
-        ],
-        data: Annotated[str, typer.Option(help="KIND:PATH of the data, e.g. nuscenes_pred:DIR")],
-        out: Annotated[Path, typer.Option(help="Folder of the run; an interrupted run goes on there.")],
-        protocol: Annotated[str, typer.Option(help="causal, or paper to compare with tables")] = "causal",
-        train_split: Annotated[str, typer.Option(help="Split to train on.")] = "train",
-        validation_split: Annotated[str, typer.Option(help="Split to choose the epoch by.")] = "train_val",
-        also: Annotated[
-            list[str] | None,
-            typer.Option(help="KIND:PATH@SPLIT of more pairs to train on; may be repeated."),
-        ] = None,
-        report_split: Annotated[
-            str | None, typer.Option(help="Split of the card's figures; default: the validation split.")
-        ] = None,
-        cache: Annotated[Path | None, typer.Option(help="Folder of caches; default: OUT/cache.")] = None,
-        config: Annotated[Path | None, typer.Option(help="TOML; default: the method's own.")] = None,
-        published: Annotated[
-            bool,
-            typer.Option("--published", help="Objective, rates and epochs of the authors' released code."),
-        ] = False,
-        epochs: Annotated[int | None, typer.Option(min=1, help="Goes before the TOML's.")] = None,
-        learning_rate: Annotated[float | None, typer.Option(help="Goes before the TOML's.")] = None,
-        seed: Annotated[int | None, typer.Option(help="Goes before the TOML's.")] = None,
-        cooldown_epochs: Annotated[
-            int | None, typer.Option(min=0, help="The last epochs, over which the learning rate goes to 0.")
-        ] = None,
-        start: Annotated[Path | None, typer.Option(help="Checkpoint whose parameters to begin with.")] = None,
-        version: Annotated[
-            str | None,
-            typer.Option(help="Of the checkpoint; default 1.0.0, or 1.0.0+paper by that protocol."),
-        ] = None,
-    ) -> None:
-        """Trains a method and writes its best epoch as a checkpoint that serve loads."""
-        from cli.training import show_training  # noqa: PLC0415
-        from model.checkpoint import CheckpointError, load_checkpoint  # noqa: PLC0415 (torch is slow to import)
-        from model.data.scenes import DataError  # noqa: PLC0415
-        from model.data.sources import parse_also, parse_data, parse_protocol  # noqa: PLC0415
-        from model.forecaster import Protocol  # noqa: PLC0415
-        from model.training.config import TrainingError, load_config, parse_method  # noqa: PLC0415
-        from model.training.run import Run, Source  # noqa: PLC0415
 
-        changes: dict[str, object] = {"epochs": epochs, "learning_rate": learning_rate, "seed": seed}
-        changes["cooldown_epochs"] = cooldown_epochs
-        try:
-            begun = None if start is None else load_checkpoint(start)
-            if begun is not None:
-                changes["start"] = f"{begun.info.full_name} ({begun.info.protocol.value})"
-            kind, path = parse_data(data)
-            source = Source(
-                kind,
-                path,
-                train_split,
-                validation_split,
-                parse_protocol(protocol),
-                report_split,
-                tuple(parse_also(one) for one in also or ()),
+def train(
+    method: Annotated[
+        str,
+        typer.Argument(
+            help="cab, trajectron, trajectron-no-context, reweight, rubiz, halentnet, "
+            "halentnet-no-context or covernet"
+        ),
+    ],
+    data: Annotated[str, typer.Option(help="KIND:PATH of the data, e.g. nuscenes_pred:DIR")],
+    out: Annotated[Path, typer.Option(help="Folder of the run; an interrupted run resumes.")],
+    protocol: Annotated[
+        str, typer.Option(help="Protocol of the inputs: causal, or paper to compare with published tables.")
+    ] = "causal",
+    train_split: Annotated[str, typer.Option(help="Training split.")] = "train",
+    validation_split: Annotated[
+        str, typer.Option(help="Validation split, which selects the best epoch.")
+    ] = "train_val",
+    extra_data: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--extra-data",
+            "--also",
+            metavar="KIND:PATH@SPLIT",
+            help="Additional training pairs; may be repeated.",
+        ),
+    ] = None,
+    report_split: Annotated[
+        str | None,
+        typer.Option(help="Split of the metrics in the model card. [default: the validation split]"),
+    ] = None,
+    cache: Annotated[
+        Path | None, typer.Option(help="Folder of cached features. [default: OUT/cache]")
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="TOML file of hyperparameters. [default: the method's own]")
+    ] = None,
+    published: Annotated[
+        bool,
+        typer.Option(
+            "--published", help="Use the objective, learning rates and epochs of the authors' released code."
+        ),
+    ] = False,
+    epochs: Annotated[int | None, typer.Option(min=1, help="Overrides the TOML file.")] = None,
+    learning_rate: Annotated[float | None, typer.Option(help="Overrides the TOML file.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Overrides the TOML file.")] = None,
+    cooldown_epochs: Annotated[
+        int | None, typer.Option(min=0, help="Last epochs, over which the learning rate decays to 0.")
+    ] = None,
+    init_from: Annotated[
+        Path | None,
+        typer.Option("--init-from", "--start", help="Checkpoint whose parameters initialize the network."),
+    ] = None,
+    version: Annotated[
+        str | None,
+        typer.Option(
+            help="Version of the new checkpoint. [default: 1.0.0; 1.0.0+paper with --protocol paper]"
+        ),
+    ] = None,
+) -> None:
+    """Train a method and write its best epoch as a checkpoint that serve can load."""
+    from model.checkpoint import CheckpointError, load_checkpoint  # noqa: PLC0415 (torch is slow to import)
+    from model.data.scenes import DataError  # noqa: PLC0415
+    from model.data.sources import parse_also, parse_data, parse_protocol  # noqa: PLC0415
+    from model.forecaster import Protocol  # noqa: PLC0415
+    from model.training.config import TrainingError, load_config, parse_method  # noqa: PLC0415
+    from model.training.run import Run, Source  # noqa: PLC0415
+
+    changes: dict[str, object] = {"epochs": epochs, "learning_rate": learning_rate, "seed": seed}
+    changes["cooldown_epochs"] = cooldown_epochs
+    try:
+        initial = None if init_from is None else load_checkpoint(init_from)
+        if initial is not None:
+            changes["start"] = f"{initial.info.full_name} ({initial.info.protocol.value})"
+        kind, path = parse_data(data)
+        source = Source(
+            kind,
+            path,
+            train_split,
+            validation_split,
+            parse_protocol(protocol),
+            report_split,
+            tuple(parse_also(each) for each in extra_data or ()),
+        )
+        default = "1.0.0+paper" if source.protocol is Protocol.PAPER else "1.0.0"
+        settings = load_config(parse_method(method), config, published=published, **changes)
+        _run(Run(settings, source, out, cache or out / "cache", version or default, initial))
+    except (TrainingError, DataError, CheckpointError) as error:
+        fail(str(error))
+
+
+def _run(run: "Run") -> None:
+    """Train, with a progress bar within the epoch and a line after each epoch."""
+    from rich.console import Console  # noqa: PLC0415
+
+    from cli.display import batches_bar  # noqa: PLC0415
+    from model.training.loop import SCORE  # noqa: PLC0415
+
+    # Under torchrun, only the process of rank 0 prints
+    console = Console(quiet=os.environ.get("RANK", "0") != "0")
+    with batches_bar(console) as bar:
+        task = bar.add_task("starting", total=None)
+
+        def tick(epoch: int, done: int, batches: int) -> None:
+            bar.update(task, description=f"epoch {epoch}", completed=done, total=batches)
+
+        def report(progress: "Progress", figures: dict[str, float]) -> None:
+            best = "best so far" if progress.best_epoch == progress.epoch else f"best {progress.best_epoch}"
+            console.print(
+                f"epoch {progress.epoch}: loss {figures['loss']:.3f}, FDE@6s {figures[SCORE]:.2f} m, "
+                f"{figures['seconds']:.0f} s ({best})"
             )
-            default = "1.0.0+paper" if source.protocol is Protocol.PAPER else "1.0.0"
-            settings = load_config(parse_method(method), config, published=published, **changes)
-            show_training(Run(settings, source, out, cache or out / "cache", version or default, begun))
-        except (TrainingError, DataError, CheckpointError) as error:
-            fail(str(error))
+
+        folder = run.train(report, tick, console.print)
+    console.print(f"checkpoint: {folder}")

@@ -1,4 +1,4 @@
-"""``python -m service``: the same as ``cab-forecast``."""
+"""Entry point of ``python -m service``, the same as ``cab-forecast``."""
 
 from cli.main import app
 

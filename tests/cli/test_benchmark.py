@@ -66,7 +66,7 @@ def test_the_tables_of_a_run_and_of_its_saved_answers(tmp_path: Path, data: str,
     for text in ("physics-oracle", "kalman", "causal protocol, nuscenes_pred split train_val"):
         assert text in shown
         assert text in (out / "tables.md").read_text()
-    assert "asked for" in said
+    assert "requested" in said
     assert len(results(out)["models"]) == 8
     # Again from what is saved, without an endpoint, into another folder
     code, _, said = run(
@@ -82,7 +82,7 @@ def test_the_tables_of_a_run_and_of_its_saved_answers(tmp_path: Path, data: str,
         "1",
     )
     assert code == 0, said
-    assert "asked for" not in said
+    assert "requested" not in said
     assert results(tmp_path / "again") == results(out)
     code, compared, said = run("compare", str(out), str(tmp_path / "again"))
     assert code == 0, said
@@ -143,7 +143,7 @@ def test_missing_forecasts_end_in_an_error(tmp_path: Path, data: str) -> None:
             *("--endpoint", f"grpc://{server.grpc_address}", "--processes", "1"),
         )
     assert code == 1
-    assert "forecasts are missing: the figures are of the others" in said
+    assert "forecasts are missing: the metrics leave them out" in said
     assert "refused: kalman@1.0.0, scene-1, frame" in said
     assert "kalman" in shown
     missing = results(tmp_path / "run")["models"][0]["statuses"]["MISSING"]

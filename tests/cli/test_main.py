@@ -3,6 +3,7 @@
 import subprocess
 import sys
 
+import pytest
 from typer.testing import CliRunner
 
 from cli.main import app
@@ -24,6 +25,13 @@ def test_help_names_the_commands_and_loads_nothing_heavy() -> None:
     )
     run = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)  # noqa: S603
     text, _, loaded = run.stdout.partition("LOADED")
-    for command in ("serve", "predict", "consistency", "convert", "train", "evaluate"):
+    for command in ("serve", "predict", "consistency", "convert", "train", "evaluate", "benchmark"):
         assert command in text
     assert not {"torch", "numpy", "matplotlib", "grpc", "httpx", "fastapi", "model"} & set(loaded.split())
+
+
+@pytest.mark.parametrize("package", ["cli", "service"])
+def test_it_runs_as_a_module(package: str) -> None:
+    command = [sys.executable, "-m", package, "--version"]
+    run = subprocess.run(command, check=True, capture_output=True, text=True)  # noqa: S603
+    assert run.stdout.startswith("cab-forecast 0.")

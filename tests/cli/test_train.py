@@ -57,12 +57,31 @@ def test_a_run_its_checkpoint_and_one_that_begins_with_it(tmp_path: Path, settin
     assert code == 0, said
     assert state(tmp_path)["progress"]["epoch"] == 2
     next_one = tmp_path / "next"
-    begin = ("--start", str(folder), "--seed", "5")
+    begin = ("--init-from", str(folder), "--seed", "5")
     code, _, said = train(next_one, "trajectron", "--config", str(settings), *begin)
     assert code == 0, said
     config = state(next_one)["config"]
     assert config["start"] == "trajectron@1.0.0 (causal)"
     assert config["seed"] == 5
+
+
+@pytest.mark.parametrize(
+    ("name", "alias", "value", "wrong"),
+    [
+        ("--init-from", "--start", "{folder}/nothing", "nothing"),
+        ("--extra-data", "--also", "nowhere", "nowhere"),
+    ],
+)
+def test_an_option_keeps_its_old_name(
+    tmp_path: Path, settings: Path, name: str, alias: str, value: str, wrong: str
+) -> None:
+    given = value.format(folder=tmp_path)
+    new, old = (
+        train(tmp_path, "trajectron", "--config", str(settings), each, given) for each in (name, alias)
+    )
+    assert new == old
+    assert new[0] == 1
+    assert wrong in new[2]
 
 
 def test_as_published(tmp_path: Path, settings: Path) -> None:
