@@ -14,8 +14,9 @@ from rich.console import Console
 from rich.table import Table
 
 from model.features.agent_features import NEIGHBOR_FEATURES, NEIGHBORS
+from model.features.spec import Frame
 from model.forecaster import Context, Features, ModelInfo, Protocol
-from model.networks.config import BlindContext, Frame, NetworkConfig
+from model.networks.config import BlindContext, NetworkConfig
 from model.networks.forecaster import CvaeForecaster, CvaeNetworks
 from model.scenes.scene import AgentType
 

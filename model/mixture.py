@@ -45,6 +45,12 @@ class TrajectoryMixture:
             self.log_weights[index], self.means[index], self.covariances[index], self.origin[index]
         )
 
+    def cpu(self) -> "TrajectoryMixture":
+        """Return the mixture on the CPU."""
+        return TrajectoryMixture(
+            self.log_weights.cpu(), self.means.cpu(), self.covariances.cpu(), self.origin.cpu()
+        )
+
     def most_likely(self) -> Tensor:
         """[N], the mode of greatest weight (the first of equals)."""
         return self.log_weights.argmax(dim=-1)
@@ -276,9 +282,9 @@ def cholesky_2x2(covariances: Tensor) -> Tensor:
     return torch.stack([torch.stack([l11, zero], dim=-1), torch.stack([l21, l22], dim=-1)], dim=-2)
 
 
-LEAST_VARIANCE = 1e-8
+MIN_VARIANCE = 1e-8
 """m², of a density; below it a variance counts as this."""
-LEAST_DECORRELATION = 1e-5
+MIN_DECORRELATION = 1e-5
 """1 − ρ², of a density; below it an ellipse counts as this slim."""
 
 
@@ -292,11 +298,11 @@ def guarded_log_density(offset: Tensor, covariance: Tensor) -> Tensor:
         offset: [..., 2], m, from the mean.
         covariance: [..., 2, 2], m².
     """
-    xx = covariance[..., 0, 0].clamp_min(LEAST_VARIANCE)
-    yy = covariance[..., 1, 1].clamp_min(LEAST_VARIANCE)
+    xx = covariance[..., 0, 0].clamp_min(MIN_VARIANCE)
+    yy = covariance[..., 1, 1].clamp_min(MIN_VARIANCE)
     sigma = (xx * yy).sqrt()
     rho = covariance[..., 0, 1] / sigma
-    free = (1 - rho.square()).clamp(LEAST_DECORRELATION, 1.0)
+    free = (1 - rho.square()).clamp(MIN_DECORRELATION, 1.0)
     dx, dy = offset[..., 0], offset[..., 1]
     squared = (dx.square() / xx + dy.square() / yy - 2 * rho * dx * dy / sigma) / free
     return -0.5 * (squared + (xx * yy * free).log()) - math.log(2 * math.pi)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from model.arrays import Ints
-from model.baselines.unimodal import require_observed, single_mode, step_times
+from model.baselines.unimodal import require_observed, step_times, unimodal
 from model.forecaster import Context, Features, Forecaster, ModelInfo, Protocol
 from model.mixture import TrajectoryMixture
 from model.scenes.scene import STEP_SECONDS, AgentType, Scene
@@ -132,7 +132,7 @@ class Kalman(Forecaster):
         mean = state.position[:, None] + time[:, None] * state.velocity[:, None]
         variance = _predict(state, time, density).var_position  # [N, T]
         covariance = torch.diag_embed(variance[..., None].expand(-1, -1, 2))
-        return single_mode(mean, covariance, features["origin"])
+        return unimodal(mean, covariance, features["origin"])
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from torch import Tensor
 from model.arrays import Ints
 from model.baselines import uncertainty
 from model.baselines.uncertainty import SpreadBySpeed, aligned_covariance
-from model.baselines.unimodal import require_observed, single_mode, step_times
+from model.baselines.unimodal import require_observed, step_times, unimodal
 from model.forecaster import Context, Features, Forecaster, ModelInfo, Protocol
 from model.mixture import TrajectoryMixture
 from model.scenes.scene import AgentType, Scene
@@ -115,7 +115,7 @@ class Physics(Forecaster):
 
         axis = torch.where((speed < HEADING_SPEED) & known, heading, course)
         covariance = aligned_covariance(self._spread[agent_type], speed, time, axis[:, None] + turned)
-        return single_mode(offset, covariance, features["position"])
+        return unimodal(offset, covariance, features["position"])
 
 
 def baselines() -> Sequence[Physics]:

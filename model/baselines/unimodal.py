@@ -40,7 +40,7 @@ def step_times(info: ModelInfo, steps: int | None) -> Tensor:
     return STEP_SECONDS * torch.arange(1, count + 1, dtype=torch.float64)
 
 
-def single_mode(means: Tensor, covariances: Tensor, origin: Tensor) -> TrajectoryMixture:
+def unimodal(means: Tensor, covariances: Tensor, origin: Tensor) -> TrajectoryMixture:
     """A mixture of one mode.
 
     Args:

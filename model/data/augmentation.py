@@ -89,8 +89,8 @@ def mirror(features: Features, future: Tensor, chosen: Tensor) -> tuple[Features
     for name, values in features.items():
         if name in {"history", "velocity"} or name.startswith(NEIGHBORS):
             mirrored[name] = _flip(values, _SIDEWAYS, sign)
-    if "surroundings" in features:
-        mirrored["surroundings"] = _flip(features["surroundings"], _BOX_SIDEWAYS, sign)
+    if "neighbor_boxes" in features:
+        mirrored["neighbor_boxes"] = _flip(features["neighbor_boxes"], _BOX_SIDEWAYS, sign)
     if "neighbors" in features:
         mirrored["neighbors"] = _flip(features["neighbors"], _NEIGHBOR_SIDEWAYS, sign)
     if "heading" in features:

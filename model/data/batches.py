@@ -67,8 +67,8 @@ class Batches:
             if wanted:
                 arrays["neighbors"] = cache.agents
             self._packed = _packed_patches(cache, config)
-        elif wanted and cache.surroundings is not None:
-            arrays["surroundings"] = cache.surroundings
+        elif wanted and cache.neighbor_boxes is not None:
+            arrays["neighbor_boxes"] = cache.neighbor_boxes
         elif wanted:
             arrays |= {neighbors_name(kind): cache.neighbors[kind] for kind in wanted}
             arrays["edge_mask"] = cache.edge_mask

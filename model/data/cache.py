@@ -20,6 +20,7 @@ from pydantic import ValidationError
 
 from model.arrays import Bytes, Float32s, Floats, Ints
 from model.data.cache_layout import (
+    FILE_NAMES,
     FORMAT_VERSION,
     MANIFEST_FILE,
     RASTERS_FILE,
@@ -37,10 +38,11 @@ from model.data.scenes import DataError, Reader, SceneRecord
 from model.data.sensing import SensedFrames
 from model.features.agent_features import HISTORY_SCALE, agent_frame_features
 from model.features.scene_features import network_features
+from model.features.spec import Frame
 from model.features.standardization import state_scale
 from model.forecaster import Context, Protocol
 from model.geometry import wrap_angle
-from model.networks.config import AnyNetworkConfig, Frame, NetworkConfig
+from model.networks.config import AnyNetworkConfig, NetworkConfig
 from model.scenes.raster import FAR, NEAR, cut_patches
 from model.scenes.scene import AgentType, Raster
 
@@ -95,7 +97,7 @@ class Cache:
     """[S, 2], m."""
     raster_pixels_per_meter: Floats
     """[S]."""
-    surroundings: Float32s | None = None
+    neighbor_boxes: Float32s | None = None
     """[P, B, 5], neighbours as boxes (``model.features.neighbor_boxes``); None: not held."""
     speed: Float32s | None = None
     """[P], m/s along the heading now; this and what follows is held in the agents' frame only."""
@@ -236,7 +238,7 @@ def _agent_frame_arrays(
         for variant in range(rows):
             seen, tracks = sensed.at(int(now), variant) if variant else recorded.at(int(now))
             targets = np.searchsorted(tracks, track[frame == now])
-            report = agent_frame_features(seen, targets, network, Context.FULL)
+            report = agent_frame_features(seen, targets, network.features, Context.FULL)
             reports.append({name: tensor.numpy() for name, tensor in report.items()})
         part: Arrays = {  # [pairs · rows, …]
             name: np.stack([one[name] for one in reports], axis=1).reshape(-1, *reports[0][name].shape[1:])
@@ -278,7 +280,7 @@ def _pair_arrays(
     for now in np.unique(frame):  # the pairs are in this order
         seen, tracks = scenes.at(int(now))
         targets = np.searchsorted(tracks, track[frame == now])
-        features = network_features(seen, targets, AgentType.VEHICLE, config, Context.FULL)
+        features = network_features(seen, targets, AgentType.VEHICLE, config.features, Context.FULL)
         part: Arrays = {name: tensor.numpy() for name, tensor in features.items()}
         part["position"] = part.pop("origin")
         part["heading"] = seen.states.heading[targets, -1]
@@ -323,7 +325,10 @@ def _save(folder: Path, parts: list[Arrays], layout: Layout) -> None:
     for name, (dtype, _) in layout.items():
         joined = np.concatenate([part[name] for part in parts])
         # Strings keep the length of the longest one
-        np.save(folder / f"{name}.npy", joined if dtype is np.bytes_ else joined.astype(dtype))
+        np.save(
+            folder / f"{FILE_NAMES.get(name, name)}.npy",
+            joined if dtype is np.bytes_ else joined.astype(dtype),
+        )
 
 
 @contextmanager
@@ -370,7 +375,7 @@ def _check_key(folder: Path, found: CacheKey, wanted: CacheKey) -> None:
 
 def _open_arrays(folder: Path, count: int, layout: Layout) -> Arrays:
     return {
-        name: _open_array(folder / f"{name}.npy", dtype, (count, *shape))
+        name: _open_array(folder / f"{FILE_NAMES.get(name, name)}.npy", dtype, (count, *shape))
         for name, (dtype, shape) in layout.items()
     }
 

@@ -9,9 +9,10 @@ from model.data.checks import FUTURE_STEPS
 from model.data.scenes import Reader
 from model.features.agent_features import NEIGHBOR_FEATURES, NEIGHBORS
 from model.features.neighbor_boxes import BOX_NUMBERS, BOXES
+from model.features.spec import Frame
 from model.features.standardization import STATE_SIZE
 from model.forecaster import Protocol
-from model.networks.config import AnyNetworkConfig, CoverNetConfig, Frame, NetworkConfig
+from model.networks.config import AnyNetworkConfig, CoverNetConfig, NetworkConfig
 from model.scenes.raster import PATCH_SIZE
 from model.scenes.scene import AgentType
 
@@ -31,6 +32,9 @@ SCENE_LAYOUT: Layout = {
     "raster_pixels_per_meter": (np.float64, ()),
 }
 """Arrays with a row per scene."""
+
+FILE_NAMES = {"neighbor_boxes": "surroundings"}
+"""File names, without their ending, of arrays that were renamed in the code: older caches go on loading."""
 
 
 class CacheKey(BaseModel):
@@ -119,7 +123,7 @@ def pair_layout(key: CacheKey) -> Layout:
     for kind in key.summed_types:
         layout[neighbors_name(kind)] = (np.float32, (frames, STATE_SIZE[kind]))
     if key.drawn:
-        layout["surroundings"] = (np.float32, (BOXES, BOX_NUMBERS))
+        layout["neighbor_boxes"] = (np.float32, (BOXES, BOX_NUMBERS))
     if key.agent_frame:
         layout |= {
             "speed": (np.float32, ()),

@@ -11,7 +11,7 @@ import torch
 
 from model.forecaster import Features, ModelInfo
 
-_NEIGHBORS = ("neighbors", "edge_mask", "surroundings")
+_NEIGHBORS = ("neighbors", "edge_mask", "neighbor_boxes")
 """Features that tell of them, up to the dot; zero means that there are none."""
 
 
@@ -43,7 +43,7 @@ def without_neighbors(features: Features) -> Features:
     Args:
         features: of ``model.features.scene_features``; ``neighbors.<type>`` [N, F, D] and ``edge_mask`` [N],
             or
-            ``neighbors`` [N, M, 11], or ``surroundings`` [N, S, 5].
+            ``neighbors`` [N, M, 11], or ``neighbor_boxes`` [N, S, 5].
     """
     gone = [name for name in features if name.partition(".")[0] in _NEIGHBORS]
     return features | {name: torch.zeros_like(features[name]) for name in gone}

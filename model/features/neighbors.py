@@ -1,8 +1,8 @@
-"""Who is whose neighbour, and what of the neighbours the network sees."""
+"""The neighbours of an agent: the nearest ones, and the edges and summed histories of Trajectron++."""
 
 import numpy as np
 
-from model.arrays import Floats, Ints
+from model.arrays import Bools, Floats, Ints
 from model.features.standardization import ATTENTION_RADIUS, HEADING, STATE_SIZE, state_scale, state_vectors
 from model.geometry import wrap_angle
 from model.scenes.scene import AgentStates, AgentType
@@ -10,22 +10,41 @@ from model.scenes.scene import AgentStates, AgentType
 _RAMP = np.array([0.25, 0.5, 0.75, 1.0])
 """Weights of presence now, 0.5 s ago, … 1.5 s ago: an edge fades in (Trajectron++, section 4.1)."""
 _PRESENCE = {AgentType.VEHICLE: 1.0, AgentType.PEDESTRIAN: 2.0}
-"""How much a neighbour's presence counts; the released code multiplies by the type's number."""
+"""Weight of a neighbour's presence; the released code multiplies by the type's number."""
+
+
+def nearest_rows(rows: Floats, distance: Floats, seen: Bools, count: int) -> Floats:
+    """Return the rows of the nearest neighbours, nearest first, zeros behind the last one: [n, count, D].
+
+    Args:
+        rows: [n, m, D], numbers of each of m neighbours, as each of n agents sees it.
+        distance: [n, m], m.
+        seen: [n, m], whether the neighbour is taken at all.
+        count: maximum number of neighbours of an agent.
+    """
+    nearest = np.argsort(np.where(seen, distance, np.inf), axis=1, kind="stable")[:, :count]
+    picked = np.take_along_axis(rows, nearest[..., None], axis=1)
+    kept = np.take_along_axis(seen, nearest, axis=1)[..., None]
+    result = np.zeros((len(rows), count, rows.shape[-1]))
+    result[:, : nearest.shape[1]] = np.where(kept, picked, 0.0)
+    return result
 
 
 def edge_ramps(
     states: AgentStates, targets: Ints, own: AgentType, neighbors: Ints, other: AgentType
 ) -> Floats:
-    """Strength of the edge from each neighbour to each target: [n, m] in [0, 1], 0 where there is none.
+    """Return the strength of the edge from each neighbour to each target: [n, m] in [0, 1], 0 for no edge.
 
-    min(1, Σ_k f_k · a_{t−k}) over the last four frames, f = (0.25, 0.5, 0.75, 1); a is the type's
-    presence while the neighbour is within the attention radius, both observed; no edge when it is not
-    within it now.
+    min(1, Σ_k f_k · a_{t−k}) over the last four frames, f = (0.25, 0.5, 0.75, 1). a is the type's presence
+    while both agents are observed and the neighbour is within the attention radius. A neighbour that is not
+    within it now has no edge.
 
     Args:
-        states: of all agents of the scene.
+        states: states of all agents of the scene.
         targets: [n], indices of agents of type ``own``.
+        own: type of the targets.
         neighbors: [m], indices of agents of type ``other``.
+        other: type of the neighbours.
     """
     frames = min(len(_RAMP), states.frames)
     position = states.position[:, -frames:]
@@ -43,17 +62,19 @@ def edge_ramps(
 def neighbor_sums(
     states: AgentStates, targets: Ints, own: AgentType, neighbors: Ints, other: AgentType, edges: Floats
 ) -> Floats:
-    """Sum of the connected neighbours' standardised histories: [n, F, STATE_SIZE[other]].
+    """Return the sum of the connected neighbours' standardised histories: [n, F, STATE_SIZE[other]].
 
-    Relative to the target's state now in the dimensions that both types have, headings by the shorter
-    arc. What was not observed of a neighbour counts as zero after standardisation. So the sum does not
-    depend on where the ground frame's origin is, nor its heading on the frame's direction. (The reference
-    has zeros before standardisation and plain differences of headings.)
+    Histories are relative to the target's state now in the dimensions that both types have, headings by the
+    shorter arc. What was not observed of a neighbour counts as zero after standardisation. So the sum depends
+    neither on the origin of the ground frame nor, in its heading, on the direction of that frame. (The
+    reference has zeros before standardisation and plain differences of headings.)
 
     Args:
-        states: of all agents of the scene.
+        states: states of all agents of the scene.
         targets: [n], indices of agents of type ``own``.
+        own: type of the targets.
         neighbors: [m], indices of agents of type ``other``.
+        other: type of the neighbours.
         edges: [n, m], connected where > 0; the sum is not weighted by it.
     """
     size = STATE_SIZE[other]
@@ -69,7 +90,7 @@ def neighbor_sums(
     total = np.tensordot(connected, np.where(known, history, 0.0), axes=1)
     counted = np.tensordot(connected, known.astype(np.float64), axes=1)
     sums: Floats = total - counted * present
-    if common > HEADING:  # angles do not subtract like lengths
+    if common > HEADING:  # differences of headings have to be wrapped
         difference = wrap_angle(history[None, ..., HEADING] - present[..., HEADING][:, None])
         sums[..., HEADING] = np.einsum("nm,nmf->nf", connected, np.nan_to_num(difference))
     sums /= state_scale(own, other)

@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, NonNegativeFloat, Tag, model_validator
 
+from model.features.spec import FeatureSpec, Frame
 from model.features.standardization import STATE_SIZE
 from model.scenes.scene import AgentType
 
@@ -23,15 +24,6 @@ class BlindContext(StrEnum):
     """The same network, on a null context (CAB, section 3)."""
     OWN = "own"
     """A second latent and decoder on the history encoding (released Reweight and RUBiZ)."""
-
-
-class Frame(StrEnum):
-    """The frame that a network sees and forecasts in."""
-
-    GROUND = "ground"
-    """The client's ground frame, moved to the agent (published Trajectron++)."""
-    AGENT = "agent"
-    """The agent's own: moved to it and turned by its heading (``model.networks.agent_frame``)."""
 
 
 class NetworkConfig(BaseModel):
@@ -82,9 +74,14 @@ class NetworkConfig(BaseModel):
             )
         return self
 
+    @property
+    def features(self) -> FeatureSpec:
+        """The features that the network takes."""
+        return FeatureSpec(self.frame, self.neighbor_types, self.uses_map, self.far_map)
+
     def looks_at_map(self, agent_type: AgentType) -> bool:
-        """Whether the network of that type has a map encoder."""
-        return self.uses_map and agent_type is AgentType.VEHICLE
+        """Return whether the network of that type has a map encoder."""
+        return self.features.looks_at_map(agent_type)
 
     def encoding_size(self, agent_type: AgentType) -> int:
         """Length of the context encoding x."""
@@ -127,9 +124,14 @@ class CoverNetConfig(BaseModel):
                 raise ValueError(f"agents of type {kind.value} are not drawn")
         return self
 
+    @property
+    def features(self) -> FeatureSpec:
+        """The features that the network takes."""
+        return FeatureSpec(Frame.GROUND, self.neighbor_types, self.uses_map, neighbor_boxes=True)
+
     def looks_at_map(self, agent_type: AgentType) -> bool:
-        """Whether forecasts of agents of that type depend on the map."""
-        return self.uses_map and agent_type in self.agent_types
+        """Return whether forecasts of agents of that type depend on the map."""
+        return self.features.looks_at_map(agent_type)
 
     @property
     def supports_blind(self) -> bool:

@@ -10,7 +10,7 @@ from model.forecaster import Context, Features
 from model.networks.config import CoverNetConfig
 from model.networks.dynamics import Positions
 from model.networks.encoders import ConvShape, MapEncoder
-from model.networks.rasterize_boxes import draw_boxes
+from model.networks.rasterize_boxes import rasterize_boxes
 from model.scenes.scene import AgentType
 
 _MAP_CHANNELS = 3
@@ -63,7 +63,7 @@ class CoverNet(nn.Module):
         """Logits of all members: [N, M]."""
         layers = [features["map"]] if self.config.uses_map else []
         if self.config.neighbor_types:
-            layers.append(draw_boxes(features["surroundings"])[:, None])
+            layers.append(rasterize_boxes(features["neighbor_boxes"])[:, None])
         picture = self.picture(torch.cat(layers, dim=1))
         own = F.relu(self.own(_kinematics(features)))
         hidden = F.relu(self.hidden(torch.cat([picture, own], dim=1)))

@@ -11,16 +11,17 @@ from torch import Tensor, nn
 from model.arrays import Ints
 from model.baselines.unimodal import require_observed
 from model.features.scene_features import network_features
+from model.features.spec import Frame
 from model.forecaster import Context, Features, Forecaster, ModelInfo
 from model.mixture import TrajectoryMixture
 from model.networks.agent_frame import AgentFrameNetwork
-from model.networks.config import AnyNetworkConfig, CoverNetConfig, Frame, NetworkConfig
+from model.networks.config import AnyNetworkConfig, CoverNetConfig, NetworkConfig
 from model.networks.covernet import CoverNet
 from model.networks.network import AgentNetwork
 from model.scenes.scene import AgentType, Scene
 
-SMALLEST_VARIANCE = 1e-6
-"""m²; no forecast is surer than that in any direction."""
+MIN_VARIANCE = 1e-6
+"""m²; the variance of a served forecast is at least that in every direction."""
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -93,7 +94,9 @@ class NetworkForecaster(Forecaster, Generic[SomeNetworks]):
         require_observed(states, targets)
         if self.requires_heading(agent_type) and np.isnan(states.heading[targets, -1]).any():
             raise ValueError("an agent to be forecast has no heading")
-        return network_features(replace(scene, states=states), targets, agent_type, self.config, context)
+        return network_features(
+            replace(scene, states=states), targets, agent_type, self.config.features, context
+        )
 
     @torch.inference_mode()
     def forecast(
@@ -104,20 +107,30 @@ class NetworkForecaster(Forecaster, Generic[SomeNetworks]):
         steps: int | None = None,
     ) -> TrajectoryMixture:
         network = self.networks.of(agent_type)
-        log_weights, positions = network(features, context, steps or self.info.steps)
-        return TrajectoryMixture(
-            log_weights, positions.mean, _positive(positions.covariance), features["origin"]
-        )
+        return network_mixture(network, features, context, steps or self.info.steps, MIN_VARIANCE)
 
 
-def _positive(covariances: Tensor) -> Tensor:
-    """Strictly positive definite covariances: what is told from one control alone has no width across.
+def network_mixture(
+    network: nn.Module, features: Features, context: Context, steps: int, min_variance: float | None = None
+) -> TrajectoryMixture:
+    """Return the forecast of a network as a mixture.
 
-    Adds a variance of (1 mm)² and a millionth of the trace, which is above float32's rounding.
+    Args:
+        network: one of ``Networks``.
+        features: the features of N agents.
+        context: full or blind.
+        steps: T.
+        min_variance: m², added to the variances with a millionth of their sum, which is above float32's
+            rounding. Then covariances are positive definite; those that come from one control alone have
+            rank one. None: covariances stay as the network gives them (training and validation).
     """
-    trace = covariances.diagonal(dim1=-2, dim2=-1).sum(-1)
-    width = SMALLEST_VARIANCE + 1e-6 * trace
-    return covariances + width[..., None, None] * torch.eye(2, dtype=covariances.dtype)
+    log_weights, positions = network(features, context, steps)
+    covariances = positions.covariance
+    if min_variance is not None:
+        trace = covariances.diagonal(dim1=-2, dim2=-1).sum(-1)
+        added = min_variance + 1e-6 * trace
+        covariances = covariances + added[..., None, None] * torch.eye(2, dtype=covariances.dtype)
+    return TrajectoryMixture(log_weights, positions.mean, covariances, features["origin"])
 
 
 def _check(expected: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> None:

@@ -13,7 +13,7 @@ _RADIUS = math.floor(BOX_REACH * PATCH_PIXELS_PER_METER + math.sqrt(0.5))
 touched by the box and its soft edge."""
 
 
-def draw_boxes(boxes: Tensor) -> Tensor:
+def rasterize_boxes(boxes: Tensor) -> Tensor:
     """A picture of boxes in the geometry of the map patch (``model.scenes.raster``): rows ahead, columns
     left.
 

@@ -26,6 +26,7 @@ from model.mixture import TrajectoryMixture, merge_modes
 from model.networks.agent_frame import AgentFrameNetwork, Modes
 from model.networks.covernet import CoverNet, turned
 from model.networks.decoder import ModeDecoder
+from model.networks.forecaster import network_mixture
 from model.networks.network import AgentNetwork
 from model.training.source import BatchSource
 
@@ -222,10 +223,9 @@ def _forecasts(network: AgentNetwork | CoverNet, pairs: BatchSource, context: Co
     judged = []
     for indices in chosen.split(_BATCH):
         features, future = pairs.batch(indices)
-        log_weights, positions = network(features, context, future.shape[1])
-        parts = (log_weights, positions.mean, positions.covariance, features["origin"])
+        mixture = network_mixture(network, features, context, future.shape[1])
         truth = (future.double() + features["origin"][:, None]).cpu().numpy()
-        judged.append((TrajectoryMixture(*(part.cpu() for part in parts)), truth))
+        judged.append((mixture.cpu(), truth))
     return judged
 
 

@@ -15,7 +15,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from model.networks.config import AnyNetworkConfig, CoverNetConfig, Frame, NetworkConfig
+from model.features.spec import Frame
+from model.networks.config import AnyNetworkConfig, CoverNetConfig, NetworkConfig
 from model.training.mixture_objective import MixtureWeights
 from model.training.precision import Precision
 

@@ -2,7 +2,8 @@
 
 import torch
 
-from model.networks.config import Frame, NetworkConfig
+from model.features.spec import Frame
+from model.networks.config import NetworkConfig
 from model.training.config import Method, TrainingConfig
 from model.training.covernet import CoverNetLearner
 from model.training.halentnet import HalentLearner

@@ -16,7 +16,7 @@ from model.metrics.evaluate import instance_metrics
 from model.metrics.standing import stood
 from model.mixture import TrajectoryMixture
 from model.networks.config import AnyNetworkConfig
-from model.networks.forecaster import Networks
+from model.networks.forecaster import Networks, network_mixture
 from model.scenes.scene import AgentType, Raster
 
 BATCH = 512
@@ -90,9 +90,7 @@ class Validation:
         network = networks.of(AgentType.VEHICLE)
         means = MetricMeans()
         for batch in self.batches():
-            features = batch.features
-            log_weights, positions = network(features, Context.FULL, batch.truth.shape[1])
-            mixture = TrajectoryMixture(log_weights, positions.mean, positions.covariance, features["origin"])
+            mixture = network_mixture(network, batch.features, Context.FULL, batch.truth.shape[1])
             means.add(batch.metrics(mixture, samples, draws))
         return {name: value for name, value in means.figures().items() if np.isfinite(value)}
 

@@ -11,7 +11,7 @@ from cab.forecast.v1.prediction_service_pb2 import PredictRequest
 from cab_forecast.layers import decode_layers
 from model.arrays import Floats
 from model.data.protocols import SceneFrames
-from model.features.scene_features import scene_features
+from model.features.scene_features import ground_frame_features
 from model.forecaster import Context, Protocol
 from model.networks.config import NetworkConfig
 from model.scenes.resample import resample
@@ -85,7 +85,7 @@ def patches(raster: Raster, protocol: Protocol = Protocol.CAUSAL) -> Floats:
     _, call = request(protocol)
     seen = Scene(scene.types, scene.states, raster)
     targets = np.searchsorted(tracks, call.tracks)
-    features = scene_features(seen, targets, AgentType.VEHICLE, NetworkConfig(), Context.FULL)
+    features = ground_frame_features(seen, targets, AgentType.VEHICLE, NetworkConfig().features, Context.FULL)
     return features["map"].numpy().astype(np.float64)
 
 

@@ -15,8 +15,9 @@ from model.data.packing import unpack_patches
 from model.data.protocols import frame_scene
 from model.data.scenes import DataError, Pair, SceneRecord, Track
 from model.features.agent_features import agent_frame_features
+from model.features.spec import Frame
 from model.forecaster import Context, Protocol
-from model.networks.config import Frame, NetworkConfig
+from model.networks.config import NetworkConfig
 from model.scenes.scene import AgentType
 from tests.model.data.records import FixedReader, record
 
@@ -45,7 +46,7 @@ def test_the_first_row_of_a_pair_is_what_serving_makes_of_it(tmp_path: Path) -> 
         whole, pair = pairs[number]
         scene, tracks = frame_scene(whole, pair.frame, Protocol.CAUSAL, 5)
         target = np.flatnonzero(tracks == pair.track)
-        wanted = agent_frame_features(scene, target, CONFIG, Context.FULL)
+        wanted = agent_frame_features(scene, target, CONFIG.features, Context.FULL)
         got, _ = batches.features(torch.tensor([ROWS * number]))
         assert got.keys() == wanted.keys()
         for name, values in wanted.items():

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from model.data.augmentation import rotate
 from model.data.protocols import frame_scene
 from model.data.scenes import SceneRecord
-from model.features.scene_features import scene_features
+from model.features.scene_features import ground_frame_features
 from model.features.standardization import HEADING
 from model.forecaster import Context, Features, Protocol
 from model.networks.config import NetworkConfig
@@ -23,7 +23,7 @@ def _features(whole: SceneRecord, frame: int, index: int, protocol: Protocol) ->
     target = np.flatnonzero(tracks == index)
     # The map stays aligned with the agent, whichever way the ground frame lies
     config = CONFIG.model_copy(update={"uses_map": False})
-    return scene_features(scene, target, AgentType.VEHICLE, config, Context.FULL)
+    return ground_frame_features(scene, target, AgentType.VEHICLE, config.features, Context.FULL)
 
 
 @settings(deadline=None, max_examples=60)

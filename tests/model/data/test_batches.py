@@ -12,7 +12,7 @@ from model.data.batches import Batches
 from model.data.cache import Cache, build_cache
 from model.data.protocols import frame_scene
 from model.data.scenes import DataError, SceneRecord
-from model.features.scene_features import scene_features
+from model.features.scene_features import ground_frame_features
 from model.forecaster import Context, Protocol, join
 from model.networks.config import CoverNetConfig, NetworkConfig
 from model.networks.covernet import present_heading
@@ -79,7 +79,7 @@ def test_they_are_the_features_of_each_scene(cache: Cache, device: str) -> None:
         whole = RECORDS[int(cache.scene[row])]
         scene, tracks = frame_scene(whole, int(cache.frame[row]), Protocol.CAUSAL, 5)
         target = np.flatnonzero(tracks == cache.track[row])
-        parts.append(scene_features(scene, target, AgentType.VEHICLE, CONFIG, Context.FULL))
+        parts.append(ground_frame_features(scene, target, AgentType.VEHICLE, CONFIG.features, Context.FULL))
     wanted = join(parts)
     assert features.keys() == wanted.keys()
     for name, value in wanted.items():
@@ -135,9 +135,9 @@ def test_batches_with_boxes(cache: Cache, tmp_path: Path) -> None:
     batches = Batches(drawn, CPU, config)
     rows = torch.arange(len(drawn))
     plain, future = batches.batch(rows)
-    assert plain.keys() == {"origin", "velocity", "history", "first", "surroundings", "map"}
+    assert plain.keys() == {"origin", "velocity", "history", "first", "neighbor_boxes", "map"}
     turned_features, turned_future = batches.batch(rows, torch.full((len(rows),), 2.0))
-    torch.testing.assert_close(turned_features["surroundings"], plain["surroundings"])
+    torch.testing.assert_close(turned_features["neighbor_boxes"], plain["neighbor_boxes"])
     # In the agents' own frames the futures are what they were
     for features, truth in ((plain, future), (turned_features, turned_future)):
         own = turned_vectors(truth, -present_heading(features))

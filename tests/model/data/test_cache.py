@@ -11,7 +11,7 @@ import pytest
 from model.data.cache import Cache, CacheKey, build_cache
 from model.data.protocols import frame_scene
 from model.data.scenes import DataError, Pair, SceneRecord
-from model.features.scene_features import network_features, scene_features
+from model.features.scene_features import ground_frame_features, network_features
 from model.forecaster import Context, Protocol
 from model.networks.config import AnyNetworkConfig, BlindContext, CoverNetConfig, NetworkConfig
 from model.scenes.scene import AgentType
@@ -44,7 +44,7 @@ def test_arrays_are_those_of_the_features(tmp_path: Path, protocol: Protocol) ->
         for pair in whole.pairs:
             scene, tracks = frame_scene(whole, pair.frame, protocol, FRAMES)
             target = np.flatnonzero(tracks == pair.track)
-            wanted = scene_features(scene, target, AgentType.VEHICLE, CONFIG, Context.FULL)
+            wanted = ground_frame_features(scene, target, AgentType.VEHICLE, CONFIG.features, Context.FULL)
             np.testing.assert_array_equal(cache.history[row], wanted["history"][0].numpy())
             np.testing.assert_array_equal(cache.first[row], wanted["first"][0].numpy())
             np.testing.assert_array_equal(cache.velocity[row], wanted["velocity"][0].numpy())
@@ -95,22 +95,22 @@ def test_a_cache_of_boxes(tmp_path: Path) -> None:
     config = CoverNetConfig()
     _build(tmp_path / "cache", config=config)
     cache = Cache.open(tmp_path / "cache", CacheKey.of(READER, "some", Protocol.CAUSAL, config, FRAMES))
-    assert cache.surroundings is not None
+    assert cache.neighbor_boxes is not None
     assert not cache.neighbors
     assert not list((tmp_path / "cache").glob("neighbors.*"))
     pairs = [(whole, pair) for whole in RECORDS for pair in whole.pairs]
     for row, (whole, pair) in enumerate(pairs):
         scene, tracks = frame_scene(whole, pair.frame, Protocol.CAUSAL, FRAMES)
         target = np.flatnonzero(tracks == pair.track)
-        wanted = network_features(scene, target, AgentType.VEHICLE, config, Context.FULL)
-        np.testing.assert_array_equal(cache.surroundings[row], wanted["surroundings"][0].numpy())
+        wanted = network_features(scene, target, AgentType.VEHICLE, config.features, Context.FULL)
+        np.testing.assert_array_equal(cache.neighbor_boxes[row], wanted["neighbor_boxes"][0].numpy())
         np.testing.assert_array_equal(cache.history[row], wanted["history"][0].numpy())
-    assert (cache.surroundings[..., 3] > 0).any()
+    assert (cache.neighbor_boxes[..., 3] > 0).any()
 
 
 def test_caches_of_histories_hold_no_boxes_and_are_found_as_before_there_were_any(tmp_path: Path) -> None:
     _build(tmp_path / "histories")
-    assert Cache.open(tmp_path / "histories").surroundings is None
+    assert Cache.open(tmp_path / "histories").neighbor_boxes is None
     manifest = tmp_path / "histories/manifest.json"
     content = json.loads(manifest.read_text())
     content["key"].pop("drawn")

@@ -9,12 +9,13 @@ from model.data.augmentation import mirror
 from model.data.protocols import frame_scene
 from model.data.scenes import SceneRecord, Track
 from model.features.agent_features import agent_frame_features
-from model.features.neighbor_boxes import surroundings
-from model.features.scene_features import scene_features
+from model.features.neighbor_boxes import neighbor_boxes
+from model.features.scene_features import ground_frame_features
+from model.features.spec import Frame
 from model.features.standardization import HEADING
 from model.forecaster import Context, Features, Protocol
-from model.networks.config import Frame, NetworkConfig
-from model.networks.rasterize_boxes import draw_boxes
+from model.networks.config import NetworkConfig
+from model.networks.rasterize_boxes import rasterize_boxes
 from model.scenes.scene import AgentType, Raster
 from tests.model.data.records import record
 
@@ -39,8 +40,8 @@ def of(whole: SceneRecord, frame: int, index: int, protocol: Protocol) -> tuple[
     """Features of a track at a frame, boxes of the agents around among them, and its future."""
     scene, tracks = frame_scene(whole, frame, protocol, 5)
     target = np.flatnonzero(tracks == index)
-    features = scene_features(scene, target, VEHICLE, CONFIG, Context.FULL)
-    features["surroundings"] = torch.from_numpy(surroundings(scene, target, CONFIG.neighbor_types))
+    features = ground_frame_features(scene, target, VEHICLE, CONFIG.features, Context.FULL)
+    features["neighbor_boxes"] = torch.from_numpy(neighbor_boxes(scene, target, CONFIG.neighbor_types))
     one = whole.tracks[index]
     now = one.frames.tolist().index(frame)
     future = one.position[now + 1 : now + 13] - one.position[now]
@@ -74,7 +75,7 @@ def test_mirroring_features_is_mirroring_the_scene(
     off = (got["map"] - wanted["map"])[..., 1:].abs()
     # Raster pixels lie on the same points up to rounding: an edge may fall to its other side
     assert off.mean() < 1e-3
-    drawn = draw_boxes(got["surroundings"]) - draw_boxes(wanted["surroundings"])
+    drawn = rasterize_boxes(got["neighbor_boxes"]) - rasterize_boxes(wanted["neighbor_boxes"])
     assert drawn.abs().max() < 1e-3
     for name, value in before.items():
         assert torch.equal(given_features[name], value)
@@ -106,7 +107,9 @@ def test_mirroring_features_in_the_agents_frame_is_mirroring_the_scene() -> None
         features = []
         for scene in (whole, reflected(whole)):
             seen, tracks = frame_scene(scene, 8, Protocol.CAUSAL, 5)
-            features.append(agent_frame_features(seen, np.flatnonzero(tracks == 0), config, Context.FULL))
+            features.append(
+                agent_frame_features(seen, np.flatnonzero(tracks == 0), config.features, Context.FULL)
+            )
         here, there = features
         future = torch.randn(1, 12, 2)
         mirrored, its_future = mirror(here, future, torch.tensor([True]))

@@ -6,7 +6,7 @@ import torch
 
 from model.baselines import physics
 from model.baselines.kalman import Kalman
-from model.baselines.unimodal import single_mode
+from model.baselines.unimodal import unimodal
 from model.data.cache import Cache, build_cache
 from model.data.protocols import frame_scene
 from model.data.scenes import DataError, Pair, SceneRecord
@@ -31,7 +31,7 @@ def test_the_oracle_chooses_for_each_pair_by_hand() -> None:
     }
     origin = torch.tensor([[10.0, 20.0], [-5.0, 0.0]], dtype=torch.float64)
     mixtures = {
-        name: single_mode(torch.tensor([[[0.0, e] for e in row] for row in errors]), COVARIANCES, origin)
+        name: unimodal(torch.tensor([[[0.0, e] for e in row] for row in errors]), COVARIANCES, origin)
         for name, errors in off.items()
     }
     truth = np.repeat(origin.numpy()[:, None], 2, axis=1)

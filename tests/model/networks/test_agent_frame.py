@@ -13,9 +13,10 @@ from torch import Tensor
 from loadtest.forward import cab_network, features_in_agent_frame
 from model.checkpoint import load_checkpoint, save_checkpoint
 from model.features.agent_features import agent_frame_features
+from model.features.spec import Frame
 from model.forecaster import Context, Features
 from model.networks.agent_frame import STEPS, AgentFrameNetwork, Modes, drive, read_patch
-from model.networks.config import BlindContext, Frame, NetworkConfig
+from model.networks.config import BlindContext, NetworkConfig
 from model.networks.forecaster import CvaeForecaster, CvaeNetworks
 from model.scenes.raster import FAR, NEAR, PatchGeometry
 from model.scenes.scene import AgentType
@@ -45,7 +46,7 @@ def test_a_scene_that_is_turned_and_shifted_is_forecast_so(
     network = AgentFrameNetwork(CONFIG).eval()
     forecasts = []
     for scene in (crowd(seed), moved(crowd(seed), angle, (dx, dy))):
-        features = agent_frame_features(scene, VEHICLES, CONFIG, Context.FULL)
+        features = agent_frame_features(scene, VEHICLES, CONFIG.features, Context.FULL)
         with torch.no_grad():
             log_weights, positions = network(features, Context.FULL, STEPS)
         forecasts.append((log_weights, positions))

@@ -101,14 +101,14 @@ def test_it_sees_map_neighbours_and_its_own_motion(model: CoverNetForecaster) ->
     plain = scores(base)
     faster = replace(base, states=replace(base.states, velocity=2 * base.states.velocity))
     alone = replace(base, types=[*TYPES[:1], *[AgentType.CYCLIST] * 8])
-    around = model.prepare(base, VEHICLES)["surroundings"][..., 3] > 0
+    around = model.prepare(base, VEHICLES)["neighbor_boxes"][..., 3] > 0
     assert around.any()
     for changed in (replace(base, raster=None), faster):
         assert (scores(changed) - plain).abs().max() > 1e-4
-    assert not (model.prepare(alone, VEHICLES[:1])["surroundings"]).any()
+    assert not (model.prepare(alone, VEHICLES[:1])["neighbor_boxes"]).any()
     seen = VEHICLES[around.any(dim=1).numpy()][:1]
     boxes = model.prepare(base, seen)
-    empty = boxes | {"surroundings": torch.zeros_like(boxes["surroundings"])}
+    empty = boxes | {"neighbor_boxes": torch.zeros_like(boxes["neighbor_boxes"])}
     assert (network.scores(boxes) - network.scores(empty)).abs().max() > 1e-5
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from model.features.neighbor_boxes import BOX_SIZE, BOXES
-from model.networks.rasterize_boxes import draw_boxes
+from model.networks.rasterize_boxes import rasterize_boxes
 
 SIZES = list(BOX_SIZE.values())
 
@@ -19,12 +19,12 @@ def picture(*boxes: tuple[float, float, float, float, float]) -> Tensor:
     padded = torch.zeros(1, BOXES, 5)
     for row, box in enumerate(boxes):
         padded[0, row] = torch.tensor(box)
-    return (draw_boxes(padded)[0] + 1) / 2
+    return (rasterize_boxes(padded)[0] + 1) / 2
 
 
 def test_nobody_is_an_empty_picture() -> None:
     assert not picture().any()
-    assert draw_boxes(torch.zeros(0, BOXES, 5)).shape == (0, 100, 100)
+    assert rasterize_boxes(torch.zeros(0, BOXES, 5)).shape == (0, 100, 100)
 
 
 @settings(deadline=None, max_examples=60)
@@ -71,6 +71,6 @@ def test_each_agent_has_its_own_picture() -> None:
     boxes = torch.zeros(2, BOXES, 5)
     boxes[0, 0] = torch.tensor([10.0, 0.0, 0.0, 4.5, 2.0])
     boxes[1, 0] = torch.tensor([20.0, 5.0, 1.0, 0.8, 0.8])
-    both = draw_boxes(boxes)
+    both = rasterize_boxes(boxes)
     for row in range(2):
-        torch.testing.assert_close(both[row], draw_boxes(boxes[row : row + 1])[0])
+        torch.testing.assert_close(both[row], rasterize_boxes(boxes[row : row + 1])[0])

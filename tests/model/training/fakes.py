@@ -16,7 +16,7 @@ class MadeUpPairs:
 
     def __init__(self, pairs: int) -> None:
         self._features = features(pairs)
-        self._features["surroundings"] = torch.zeros(pairs, BOXES, BOX_NUMBERS)
+        self._features["neighbor_boxes"] = torch.zeros(pairs, BOXES, BOX_NUMBERS)
         ahead = 0.5 * torch.arange(1, 13)
         self._future = self._features["velocity"][:, None, :] * ahead[:, None]
         self._turned = torch.linspace(0, 1, pairs)

@@ -9,9 +9,10 @@ from torch.distributions import MultivariateNormal
 
 from loadtest.forward import features_in_agent_frame
 from model.features.agent_features import NEIGHBOR_POSITION_SCALE, NEIGHBOR_VELOCITY_SCALE
+from model.features.spec import Frame
 from model.forecaster import Context, Features
 from model.networks.agent_frame import STEPS, AgentFrameNetwork
-from model.networks.config import BlindContext, Frame, NetworkConfig
+from model.networks.config import BlindContext, NetworkConfig
 from model.training.mixture_objective import MixtureWeights, mixture_objective, step_log_density
 
 CONFIG = NetworkConfig(frame=Frame.AGENT, far_map=True, blind=BlindContext.NULL, modes=12)

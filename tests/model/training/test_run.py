@@ -12,8 +12,9 @@ from safetensors.torch import load_file
 from model.checkpoint import load_checkpoint
 from model.data.scenes import DataError
 from model.data.sources import READERS, parse_data
+from model.features.spec import Frame
 from model.forecaster import Protocol
-from model.networks.config import BlindContext, CoverNetConfig, Frame, NetworkConfig
+from model.networks.config import BlindContext, CoverNetConfig, NetworkConfig
 from model.registry import Registry
 from model.scenes.scene import AgentType
 from model.training.calibration import MOST, Calibration
