@@ -13,8 +13,8 @@ from model.mixture import TrajectoryMixture, merge_modes
 from model.scenes.scene import STEP_SECONDS
 from service.predict.batcher import Outcome
 from service.predict.catalog import reference
-from service.predict.options import Options
 from service.predict.plan import Draft, Plan
+from service.predict.request import Options
 
 
 @dataclass(frozen=True)

@@ -21,14 +21,13 @@ from model.forecaster import Forecaster
 from model.scenes.resample import history_seconds
 from service.errors import BadField, DeadlineExceeded, Fault, Unavailable
 from service.lifecycle import Lifecycle, Phase
-from service.predict.agents import Agents, read_agents
 from service.predict.batcher import Admission, Batcher, Outcome
 from service.predict.catalog import Catalog, Models, build_catalog, reference
 from service.predict.encode import Result, encode, finite
 from service.predict.off_road import count_off_road
-from service.predict.options import Options, read_options
 from service.predict.plan import Draft, Group, Plan, check_strict, fall_back, frames_of, make_plan
-from service.predict.request_decoder import Encoded, Reader
+from service.predict.request import Agents, Options, read_agents, read_options
+from service.predict.request_reader import EncodedRequest, RequestReader
 from service.predict.torch_threads import set_helper_threads
 from service.predict.track_updates import observed, report, sightings, with_histories
 from service.predict.warmup import warm_up
@@ -97,7 +96,7 @@ class DataPlane:
             thread_name_prefix="calls",
             initializer=set_helper_threads,
         )
-        self._reader = Reader(self._threads)
+        self._reader = RequestReader(self._threads)
         self._store = make_store(settings)
         store_metrics = StoreMetrics(metrics.registry)
         self._guard = Guard(store_metrics.observe, store_metrics.failed)
@@ -178,7 +177,7 @@ class DataPlane:
             yield Call(asyncio.get_running_loop().time() + seconds, catalog)
 
     async def predict(
-        self, request: pb.PredictRequest | Encoded, call: Call | None = None
+        self, request: pb.PredictRequest | EncodedRequest, call: Call | None = None
     ) -> pb.PredictResponse:
         """Forecasts the agents of a scene. Cancelling the call takes it out of the queue.
 
@@ -194,7 +193,7 @@ class DataPlane:
                 return await self.predict(request, own)
         accepted = time.perf_counter()
         async with call.in_time():
-            message = await self._reader.read(request) if isinstance(request, Encoded) else request
+            message = await self._reader.read(request) if isinstance(request, EncodedRequest) else request
             return await self._predict(message, call, accepted)
 
     async def list_models(self, request: models_pb.ListModelsRequest) -> models_pb.ListModelsResponse:

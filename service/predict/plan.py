@@ -12,10 +12,9 @@ from model.forecaster import Context, Forecaster, Protocol
 from model.scenes.resample import MAX_AGE, MAX_GAP, MIN_DIFFERENCE_SPAN, resample
 from model.scenes.scene import AgentType, Raster, Scene
 from service.errors import BadFields, Fault
-from service.predict.agents import Agents, read_agents
 from service.predict.batcher import Job
 from service.predict.catalog import Catalog
-from service.predict.options import Options, read_raster
+from service.predict.request import Agents, Options, read_agents, read_raster
 from service.settings import FALLBACK_MODEL, Settings
 
 

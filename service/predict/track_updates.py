@@ -7,9 +7,9 @@ from typing import TypeAlias
 from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.forecaster import Context, Forecaster
-from service.predict.agents import Agents
 from service.predict.encode import Result
 from service.predict.plan import Plan
+from service.predict.request import Agents
 from service.tracking.store.base import Sighting
 from service.tracking.store.records import KINDS, pack_forecasts, pack_observations, unpack_observations
 from service.tracking.tracker import Tracked

@@ -16,7 +16,7 @@ from model.forecaster import Context, Protocol
 from model.networks.config import NetworkConfig
 from model.scenes.resample import resample
 from model.scenes.scene import AgentStates, AgentType, Raster, Scene
-from service.predict.agents import read_agents
+from service.predict.request import read_agents
 from service.settings import Settings
 from tests.benchmark.scenes import planned
 from tests.model.data.records import raster

@@ -9,9 +9,7 @@ from google.protobuf.message import Message
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from service.predict.pipeline import DataPlane
-from service.predict.protobuf_request import read_request
-from service.predict.request_decoder import LARGE_BYTES, Encoded
-from service.predict.request_limits import Sizes
+from service.predict.request_reader import LARGE_BYTES, EncodedRequest, RequestLimits, read_protobuf
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
 from service.transports.grpc.calls import Calls, Context
@@ -30,7 +28,7 @@ class Handlers:
         self._dataplane = dataplane
         self._calls = Calls(metrics, settings)
         self._consistency = ConsistencyHandlers(dataplane, self._calls)
-        self._read_request = functools.partial(read_request, sizes=Sizes.of(settings))
+        self._read_request = functools.partial(read_protobuf, limits=RequestLimits.from_settings(settings))
 
     def generic(self) -> "list[grpc.GenericRpcHandler[bytes, bytes]]":
         """For ``server.add_generic_rpc_handlers``."""
@@ -46,7 +44,7 @@ class Handlers:
         call = held.enter_context(self._dataplane.accept(context.time_remaining()))
         # Not when this returns: the answer is yet to be sent, however slowly the client takes it
         context.add_done_callback(lambda _: held.close())
-        return await self._dataplane.predict(Encoded(body, self._read_request, LARGE_BYTES), call)
+        return await self._dataplane.predict(EncodedRequest(body, self._read_request, LARGE_BYTES), call)
 
     def _of_models(self) -> "dict[str, grpc.RpcMethodHandler[bytes, bytes]]":
         unary, plane = self._calls.unary, self._dataplane

@@ -7,10 +7,8 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from cab.forecast.v1 import model_service_pb2 as models_pb
-from service.predict import protobuf_request
 from service.predict.pipeline import DataPlane
-from service.predict.request_decoder import LARGE_BYTES, Encoded
-from service.predict.request_limits import Sizes
+from service.predict.request_reader import LARGE_BYTES, EncodedRequest, RequestLimits, read_protobuf
 from service.settings import Settings
 from service.transports.rest import json_request
 from service.transports.rest.calls import Calls, respond, unless_disconnected
@@ -24,7 +22,7 @@ class Endpoints:
     def __init__(self, dataplane: DataPlane, calls: Calls, settings: Settings) -> None:
         self._dataplane = dataplane
         self._calls = calls
-        self._sizes = Sizes.of(settings)
+        self._limits = RequestLimits.from_settings(settings)
 
     async def predict(self, request: Request) -> Response:
         """POST /v1/predict."""
@@ -57,7 +55,7 @@ class Endpoints:
         name: str = request.path_params["name"]
         return respond(await self._dataplane.get_model(models_pb.GetModelRequest(name=name)), outgoing)
 
-    def _encoded(self, body: bytes, incoming: Format) -> Encoded:
+    def _encoded(self, body: bytes, incoming: Format) -> EncodedRequest:
         if incoming is Format.JSON:  # never quick
-            return Encoded(body, functools.partial(json_request.read_request, sizes=self._sizes))
-        return Encoded(body, functools.partial(protobuf_request.read_request, sizes=self._sizes), LARGE_BYTES)
+            return EncodedRequest(body, functools.partial(json_request.read_request, limits=self._limits))
+        return EncodedRequest(body, functools.partial(read_protobuf, limits=self._limits), LARGE_BYTES)

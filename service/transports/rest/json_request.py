@@ -9,7 +9,7 @@ from typing import Any
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from service.errors import TooLarge
-from service.predict.request_limits import Sizes
+from service.predict.request_reader import RequestLimits
 from service.transports.rest.codec import from_document, load_document
 
 _AGENTS = pb.PredictRequest.DESCRIPTOR.fields_by_number[pb.PredictRequest.AGENTS_FIELD_NUMBER].name
@@ -26,16 +26,16 @@ _VALUES_OF_AN_AGENT = 512
 _VALUES_OF_A_STATE = len(pb.AgentState.DESCRIPTOR.fields)
 
 
-def read_request(body: bytes, sizes: Sizes) -> pb.PredictRequest:
+def read_request(body: bytes, limits: RequestLimits) -> pb.PredictRequest:
     """A request from JSON.
 
     Raises:
         TooLarge: it holds more agents or states than it may.
         BadField: it is no request; names the field as far as it can be told.
     """
-    _check_body(body, sizes)
+    _check_body(body, limits)
     document = load_document(body)
-    _check_document(document, sizes)
+    _check_document(document, limits)
     states = _take_plain_states(document)
     request = from_document(pb.PredictRequest, document)
     for index, plain in states.items():
@@ -43,21 +43,21 @@ def read_request(body: bytes, sizes: Sizes) -> pb.PredictRequest:
     return request
 
 
-def _check_body(body: bytes, sizes: Sizes) -> None:
+def _check_body(body: bytes, limits: RequestLimits) -> None:
     """Bounds what the JSON parser makes, which is twenty times the size of the text at worst."""
-    if body.count(b"{") + body.count(b"[") > sizes.states + _BRACKETS_OF_AN_AGENT * (sizes.agents + 1):
-        raise TooLarge(f"more objects than {sizes.agents} agents and {sizes.states} states have")
-    if body.count(b",") > sizes.states * _VALUES_OF_A_STATE + _VALUES_OF_AN_AGENT * (sizes.agents + 1):
-        raise TooLarge(f"more values than {sizes.agents} agents and {sizes.states} states have")
+    if body.count(b"{") + body.count(b"[") > limits.states + _BRACKETS_OF_AN_AGENT * (limits.agents + 1):
+        raise TooLarge(f"more objects than {limits.agents} agents and {limits.states} states have")
+    if body.count(b",") > limits.states * _VALUES_OF_A_STATE + _VALUES_OF_AN_AGENT * (limits.agents + 1):
+        raise TooLarge(f"more values than {limits.agents} agents and {limits.states} states have")
 
 
-def _check_document(document: dict[str, Any], sizes: Sizes) -> None:
+def _check_document(document: dict[str, Any], limits: RequestLimits) -> None:
     agents = document.get(_AGENTS)
     if not isinstance(agents, list):
         return
-    sizes.check_agents(len(agents))
+    limits.check_agents(len(agents))
     states = [agent[_STATES] for agent in agents if isinstance(agent, dict) and _STATES in agent]
-    sizes.check_states(sum(len(each) for each in states if isinstance(each, list)))
+    limits.check_states(sum(len(each) for each in states if isinstance(each, list)))
 
 
 def _take_plain_states(document: dict[str, Any]) -> dict[int, list[pb.AgentState]]:

@@ -13,7 +13,7 @@ from model.data.scenes import DataError, SceneRecord
 from model.forecaster import Protocol
 from model.scenes.resample import resample
 from model.scenes.scene import AgentType
-from service.predict.agents import read_agents
+from service.predict.request import read_agents
 from service.settings import Settings
 from tests.nuscenes_pred import real_raster, real_request
 

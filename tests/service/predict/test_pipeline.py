@@ -16,7 +16,7 @@ from model.scenes.scene import AgentType
 from service.errors import BadField, BadFields, DeadlineExceeded, Overloaded, Unavailable, UnknownModel
 from service.lifecycle import Phase
 from service.predict.pipeline import DataPlane
-from service.predict.request_decoder import Encoded
+from service.predict.request_reader import EncodedRequest
 from service.settings import FALLBACK_MODEL, SettingsError
 from service.telemetry.metrics import Metrics
 from tests.service.fakes import FakeForecaster, registry
@@ -490,19 +490,19 @@ async def test_warm_up_meets_every_shape_of_the_default_model() -> None:
     plane = DataPlane(settings(default_model="fake", max_batch_agents=6), Metrics())
     await plane.open(lambda: registry(fake, other))
     await plane.close()
-    sizes = [agents for kind, agents, context, _ in fake.batches if context is Context.BLIND]
-    assert sizes == [1, 2, 4, 6] * 2  # vehicles and pedestrians
+    limits = [agents for kind, agents, context, _ in fake.batches if context is Context.BLIND]
+    assert limits == [1, 2, 4, 6] * 2  # vehicles and pedestrians
     assert [agents for _, agents, _, _ in other.batches] == [1] * 2
 
 
-def slow(seconds: float) -> Encoded:
+def slow(seconds: float) -> EncodedRequest:
     """A request that takes so long to read."""
 
     def read(_: bytes) -> pb.PredictRequest:
         time.sleep(seconds)
         return make_request(1)
 
-    return Encoded(b"", read, quick_bytes=-1)
+    return EncodedRequest(b"", read, inline_bytes=-1)
 
 
 async def test_time_in_the_queue_is_all_the_time_before_the_model() -> None:

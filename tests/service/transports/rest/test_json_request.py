@@ -13,15 +13,15 @@ from hypothesis import given
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from service.errors import BadField, TooLarge
-from service.predict.request_limits import Sizes
+from service.predict.request_reader import RequestLimits
 from service.settings import Settings
 from service.transports.rest.codec import parse_json
 from service.transports.rest.json_request import read_request
 from tests.service.requests import add_agent, make_request
 from tests.service.timing import cpu_seconds
 
-SIZES = Sizes(agents=3, states=5)
-DEFAULT = Sizes.of(Settings())
+LIMITS = RequestLimits(agents=3, states=5)
+DEFAULT = RequestLimits.from_settings(Settings())
 STATE_NAMES = [field.name for field in pb.AgentState.DESCRIPTOR.fields]
 
 
@@ -40,8 +40,8 @@ def test_requests_are_read(snake: bool) -> None:
 
 
 def test_as_many_as_may_be() -> None:
-    assert len(read_request(document([{}] * 3), SIZES).agents) == 3
-    [agent] = read_request(document([{"states": [{}] * 5}]), SIZES).agents
+    assert len(read_request(document([{}] * 3), LIMITS).agents) == 3
+    [agent] = read_request(document([{"states": [{}] * 5}]), LIMITS).agents
     assert len(agent.states) == 5
 
 
@@ -60,7 +60,7 @@ def test_as_many_as_may_be() -> None:
 )
 def test_too_large(agents: list[Any], message: str) -> None:
     with pytest.raises(TooLarge, match=message):
-        read_request(document(agents), SIZES)
+        read_request(document(agents), LIMITS)
 
 
 @pytest.mark.parametrize(
@@ -93,8 +93,8 @@ def test_the_largest_request_takes_a_second_not_a_minute() -> None:
 
 
 def test_too_many_states_of_one_agent_are_read() -> None:
-    sizes = Sizes.of(Settings(max_agents=2, max_states=5))
-    assert len(read_request(document([{"states": [{}] * 6}]), sizes).agents[0].states) == 6
+    limits = RequestLimits.from_settings(Settings(max_agents=2, max_states=5))
+    assert len(read_request(document([{"states": [{}] * 6}]), limits).agents[0].states) == 6
 
 
 @pytest.mark.parametrize(
@@ -140,10 +140,10 @@ def outcome(read: Callable[[bytes], pb.PredictRequest], body: bytes) -> object:
 def test_plain_states_are_read_as_protobuf_reads_them(given_agents: list[dict[str, Any]]) -> None:
     body = document(given_agents)
     expected = outcome(functools.partial(parse_json, pb.PredictRequest), body)
-    assert outcome(functools.partial(read_request, sizes=DEFAULT), body) == expected
+    assert outcome(functools.partial(read_request, limits=DEFAULT), body) == expected
 
 
 @given(st.binary(max_size=60))
 def test_any_bytes_are_a_request_or_refused(body: bytes) -> None:
     with suppress(BadField, TooLarge):
-        read_request(body, SIZES)
+        read_request(body, LIMITS)

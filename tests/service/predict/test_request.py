@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.scenes.scene import AgentType
 from service.errors import Fault
-from service.predict.agents import read_agents
+from service.predict.request import read_agents
 from service.settings import Settings
 from tests.service.requests import NOW, PEDESTRIAN, add_agent, make_request, pack, png
 from tests.service.timing import cpu_seconds
@@ -153,7 +153,7 @@ def test_of_a_hundred_thousand_faults_one_an_agent_is_put_into_words(
     for index in range(200):
         request.agents.add(id=f"a{index}", type=1, states=[state] * 500)
     put = Mock(side_effect=Fault)
-    monkeypatch.setattr("service.predict.agents.Fault", put)
+    monkeypatch.setattr("service.predict.request.Fault", put)
     faults = read_agents(request, SETTINGS).faults
     assert faults[199].field == f"agents[199].states[0].{field}"
     assert put.call_count == 200

@@ -1,11 +1,12 @@
-"""The agents of a request: what is wrong with which, and the observations of the others.
+"""Validation of a decoded request: its options, its map and its agents.
 
-A call of 128 agents with 20 states each has 23,000 numbers, most of them optional; asking protobuf for
-each one's value and presence would take longer than many a forecast. So states are re-encoded one by
-one, which is one call into C each, and their numbers picked out of the bytes by numpy: on the wire a
-double is a tag byte and eight bytes.
+A fault of the call as a whole raises; a fault of one agent leaves that agent out. A call of 128 agents with
+20 states each has 23,000 numbers, most of them optional, and reading each one's value and presence from
+protobuf takes longer than many a forecast. States are therefore serialised one by one, which is one call into
+C each, and numpy reads their numbers from the bytes: in wire format a double is a tag byte and eight bytes.
 """
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,17 +17,20 @@ from google.protobuf.descriptor import FieldDescriptor
 
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
-from cab.forecast.v1.bounds import FIELD_BOUNDS, MAX_ID_LENGTH, PATCH_PIXELS
+from cab.forecast.v1.bounds import FIELD_BOUNDS, MAX_ID_LENGTH, PATCH_PIXELS, STEP_SECONDS
 from model.arrays import Bools, Bytes, Float32s, Floats, Ints
+from model.forecaster import Context, ModelInfo
 from model.scenes.observations import JUMP_SLACK, MAX_SPEED, Observations
 from model.scenes.resample import MAX_AGE, TIME_TOLERANCE
-from model.scenes.scene import AgentType
-from service.errors import BadField, Fault, id_too_long
-from service.predict.images import decode_layers
+from model.scenes.scene import AgentType, Raster
+from service.errors import BadField, Fault, TooLarge, id_too_long
+from service.predict.map_image import decode_layers
 from service.settings import Settings
 
 _PatchName = Literal["map_patch", "far_map_patch"]
 _PATCH_NAMES: tuple[_PatchName, ...] = get_args(_PatchName)
+_RasterNumber = Literal["origin_x", "origin_y", "pixels_per_meter"]
+_RASTER_NUMBERS: tuple[_RasterNumber, ...] = get_args(_RasterNumber)
 
 TYPES = {
     models_pb.AGENT_TYPE_VEHICLE: AgentType.VEHICLE,
@@ -34,12 +38,22 @@ TYPES = {
     models_pb.AGENT_TYPE_CYCLIST: AgentType.CYCLIST,
     models_pb.AGENT_TYPE_UNKNOWN: AgentType.UNKNOWN,
 }
+_CONTEXTS = {
+    pb.CONTEXT_UNSPECIFIED: Context.FULL,
+    pb.CONTEXT_FULL: Context.FULL,
+    pb.CONTEXT_BLIND: Context.BLIND,
+}
+_RECALLS = {
+    pb.HISTORY_SOURCE_UNSPECIFIED: False,
+    pb.HISTORY_SOURCE_REQUEST: False,
+    pb.HISTORY_SOURCE_MEMORY: True,
+}
 
 _FIELDS = [field.name for field in pb.AgentState.DESCRIPTOR.fields]
 _TIME, _X, _Y, _HEADING, _VX, _VY, _AX, _AY, _RATE = range(9)
 _REQUIRED = [_TIME, _X, _Y]
 _PAIRS = [(_VX, _VY), (_AX, _AY)]
-_BOUNDS = np.array([FIELD_BOUNDS[f"AgentState.{name}"][1] for name in _FIELDS])  # either way
+_BOUNDS = np.array([FIELD_BOUNDS[f"AgentState.{name}"][1] for name in _FIELDS])  # of the absolute value
 _FIXED64 = 1  # wire type
 _TAG_BYTES = np.array([field.number << 3 | _FIXED64 for field in pb.AgentState.DESCRIPTOR.fields])
 _DOUBLE_BYTES = 9  # tag and value
@@ -47,35 +61,151 @@ if len(_FIELDS) != _RATE + 1 or any(
     field.type != FieldDescriptor.TYPE_DOUBLE or field.number != index + 1
     for index, field in enumerate(pb.AgentState.DESCRIPTOR.fields)
 ):
-    raise ImportError("AgentState has changed: service.predict.agents reads its wire form")
+    raise ImportError("AgentState has changed: service.predict.request reads its wire format")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Validated options of a call."""
+
+    time: float
+    """Current time, s since the epoch."""
+    steps: int
+    """Number of forecast steps."""
+    context: Context
+    max_modes: int
+    """Max number of modes in the response; 0: all."""
+    merge: bool
+    """Flag for merging modes that a planner would not tell apart."""
+    samples: int
+    seed: int | None
+    strict: bool
+    predicted: int
+    """Number of agents to forecast."""
+    scene_id: str
+    """Empty if the call is not tracked."""
+    recalls: bool
+    """Flag for histories from the track memory."""
+    consistency: bool
+    """Flag for each agent's latest consistency in the response."""
 
 
 @dataclass(frozen=True)
 class Agents:
-    """The agents of one request."""
+    """Validated agents of one request: N in all, V of them valid."""
 
     ids: Sequence[str]
     predict: Bools
-    """[N], which ones get a forecast."""
+    """Flags of agents to forecast: [N]."""
     faults: dict[int, Fault]
-    """By index; these agents are left out."""
+    """First fault of each invalid agent, by index in the request."""
     valid: Ints
-    """[V], indices of the others."""
+    """Indices of the valid agents in the request: [V]."""
     types: Sequence[AgentType]
-    """[V], of the valid ones."""
+    """Types of the valid agents: [V]."""
     observations: Observations | None
-    """Of the valid ones; None when there are none."""
+    """Observations of the valid agents; None if there are none."""
     patches: dict[int, Bytes | Float32s]
-    """Own map patches by index among the valid ones, each [3, 100, 100]."""
+    """Own map patches, each [3, 100, 100], by index among the valid agents."""
     far_patches: dict[int, Bytes | Float32s]
     """Own far map patches, likewise."""
 
 
-def read_agents(request: pb.PredictRequest, settings: Settings) -> Agents:
-    """Checks each agent for itself; an agent's first fault is reported, in the order of its fields.
+def read_options(request: pb.PredictRequest, info: ModelInfo, settings: Settings) -> Options:
+    """Validate everything but agents and map.
 
     Args:
-        request: with a valid ``time``.
+        request: the request.
+        info: the requested model.
+        settings: the limits.
+
+    Raises:
+        BadField: a field is missing or out of its bounds.
+        TooLarge: there are too many agents.
+    """
+    if len(request.agents) > settings.max_agents:
+        raise TooLarge(f"{len(request.agents)} agents; at most {settings.max_agents} are accepted")
+    if len(request.scene_id) > MAX_ID_LENGTH:
+        raise BadField("scene_id", id_too_long(request.scene_id))
+    if not request.HasField("time"):
+        raise BadField("time", "is required")
+    _check_number("time", request.time, *FIELD_BOUNDS["PredictRequest.time"])
+
+    options = request.options
+    context = _CONTEXTS.get(options.context)
+    if context is None:
+        raise BadField("options.context", f"unknown value {options.context}")
+    if context is Context.BLIND and not info.supports_blind:
+        raise BadField("options.context", f"{info.name} has no blind forecast")
+    if options.history not in _RECALLS:
+        raise BadField("options.history", f"unknown value {options.history}")
+    recalls = _RECALLS[options.history]
+    for name, requested in (("history", recalls), ("consistency", options.consistency)):
+        if requested and not request.scene_id:
+            raise BadField(f"options.{name}", "needs a scene_id")
+    predicted = sum(not agent.HasField("predict") or agent.predict for agent in request.agents)
+    if options.samples > settings.max_samples:
+        raise BadField("options.samples", f"at most {settings.max_samples}")
+    if options.samples * predicted > settings.max_samples_per_call:
+        raise BadField(
+            "options.samples",
+            f"{options.samples} × {predicted} agents; at most {settings.max_samples_per_call} in a call",
+        )
+    return Options(
+        time=request.time,
+        steps=_steps(options, info),
+        context=context,
+        max_modes=options.max_modes,
+        merge=options.merge,
+        samples=options.samples,
+        seed=options.seed if options.HasField("seed") else None,
+        strict=options.strict,
+        predicted=predicted,
+        scene_id=request.scene_id,
+        recalls=recalls,
+        consistency=options.consistency,
+    )
+
+
+def read_raster(request: pb.PredictRequest, settings: Settings) -> Raster | None:
+    """Return the map of the whole scene; None if the request has none.
+
+    Raises:
+        BadField: a field of the map is missing, out of its bounds, or contradicts another.
+    """
+    if not request.HasField("scene_raster"):
+        return None
+    raster = request.scene_raster
+    for number in _RASTER_NUMBERS:
+        if not raster.HasField(number):
+            raise BadField(f"scene_raster.{number}", "is required")
+        bounds = FIELD_BOUNDS[f"SceneRaster.{number}"]
+        _check_number(f"scene_raster.{number}", getattr(raster, number), *bounds)
+    if raster.image.WhichOneof("encoding") == "packed_bits":
+        for name, size in (("rows", raster.rows), ("columns", raster.columns)):
+            if size == 0:
+                raise BadField(f"scene_raster.{name}", "is required with packed_bits")
+    if raster.rows * raster.columns > settings.max_raster_pixels:
+        raise BadField(
+            "scene_raster.rows",
+            f"{raster.rows} × {raster.columns} pixels; at most {settings.max_raster_pixels} are accepted",
+        )
+    layers = decode_layers(
+        raster.image,
+        "scene_raster.image",
+        raster.rows or None,
+        raster.columns or None,
+        settings.max_raster_pixels,
+    )
+    origin = np.array([raster.origin_x, raster.origin_y])
+    return Raster(layers=layers, origin=origin, pixels_per_meter=raster.pixels_per_meter)
+
+
+def read_agents(request: pb.PredictRequest, settings: Settings) -> Agents:
+    """Validate each agent on its own, and report the first fault of each, in the order of its fields.
+
+    Args:
+        request: the request, with a valid ``time``.
         settings: the limits.
     """
     agents = request.agents
@@ -115,46 +245,63 @@ def read_agents(request: pb.PredictRequest, settings: Settings) -> Agents:
     )
 
 
-def _read_patch(agent: pb.Agent, name: _PatchName, here: str) -> Bytes:
+def _steps(options: pb.PredictOptions, info: ModelInfo) -> int:
+    if not options.HasField("horizon"):
+        return info.steps
+    _check_number("options.horizon", options.horizon, STEP_SECONDS, info.horizon)
+    steps = round(options.horizon / STEP_SECONDS)
+    if abs(steps * STEP_SECONDS - options.horizon) > 1e-6:
+        raise BadField("options.horizon", f"must be a multiple of {STEP_SECONDS} s")
+    return steps
+
+
+def _check_number(field: str, value: float, low: float, high: float) -> None:
+    if not math.isfinite(value):
+        raise BadField(field, "must be a finite number")
+    if not low <= value <= high:
+        raise BadField(field, f"must be within {low:g} … {high:g}")
+
+
+def _read_patch(agent: pb.Agent, name: _PatchName, path: str) -> Bytes:
     """Return one of an agent's own map patches: [3, 100, 100].
 
     Raises:
-        BadField: it is no such patch.
+        BadField: the image is malformed or of another size.
     """
     image: pb.LayerImage = getattr(agent, name).image
-    return decode_layers(image, f"{here}.{name}.image", PATCH_PIXELS, PATCH_PIXELS, PATCH_PIXELS**2)
+    return decode_layers(image, f"{path}.{name}.image", PATCH_PIXELS, PATCH_PIXELS, PATCH_PIXELS**2)
 
 
 def _by_row(images: Mapping[int, Bytes], valid: Sequence[int]) -> dict[int, Bytes | Float32s]:
-    """Return the images of valid agents by their index among those."""
+    """Return the images of valid agents by index among the valid agents."""
     return {row: images[index] for row, index in enumerate(valid) if index in images}
 
 
 def _head_faults(request: pb.PredictRequest, ids: Sequence[str], settings: Settings) -> dict[int, Fault]:
-    """Faults outside the states' contents."""
+    """Return the faults outside the contents of states and patches."""
     faults: dict[int, Fault] = {}
     uses = Counter(ids)
     for index, (agent, agent_id) in enumerate(zip(request.agents, ids, strict=True)):
-        here = f"agents[{index}]"
+        path = f"agents[{index}]"
         if not agent_id:
-            faults[index] = Fault(f"{here}.id", "is required")
+            faults[index] = Fault(f"{path}.id", "is required")
         elif len(agent_id) > MAX_ID_LENGTH:
-            faults[index] = Fault(f"{here}.id", id_too_long(agent_id))
+            faults[index] = Fault(f"{path}.id", id_too_long(agent_id))
         elif uses[agent_id] > 1:
-            faults[index] = Fault(f"{here}.id", f"{uses[agent_id]} agents share it")
+            faults[index] = Fault(f"{path}.id", f"{uses[agent_id]} agents share it")
         elif agent.type == models_pb.AGENT_TYPE_UNSPECIFIED:
-            faults[index] = Fault(f"{here}.type", "type is required")
+            faults[index] = Fault(f"{path}.type", "type is required")
         elif agent.type not in TYPES:
-            faults[index] = Fault(f"{here}.type", f"unknown value {agent.type}")
+            faults[index] = Fault(f"{path}.type", f"unknown value {agent.type}")
         elif not agent.states:
-            faults[index] = Fault(f"{here}.states", "at least one is required")
+            faults[index] = Fault(f"{path}.states", "at least one is required")
         elif len(agent.states) > settings.max_states:
-            faults[index] = Fault(f"{here}.states", f"has {len(agent.states)}; at most {settings.max_states}")
+            faults[index] = Fault(f"{path}.states", f"has {len(agent.states)}; at most {settings.max_states}")
     return faults
 
 
 def _state_values(states: Sequence[pb.AgentState]) -> tuple[Floats, Bools]:
-    """Values [M, 9] and whether they were given [M, 9]; NaN where not."""
+    """Return values [M, 9], NaN where absent, and their presence [M, 9]."""
     values = np.full((len(states), len(_FIELDS)), np.nan)
     present = np.zeros(values.shape, dtype=np.bool_)
     encoded = [state.SerializeToString() for state in states]
@@ -173,7 +320,7 @@ def _state_values(states: Sequence[pb.AgentState]) -> tuple[Floats, Bools]:
 
 
 def _without_unknown_fields(states: Sequence[pb.AgentState]) -> list[pb.AgentState]:
-    """Copies without what a newer client may have sent: only known fields have the plain wire form."""
+    """Return copies without the fields of a newer client: only known fields have the plain wire format."""
     copies = []
     for state in states:
         copy = pb.AgentState()
@@ -184,16 +331,16 @@ def _without_unknown_fields(states: Sequence[pb.AgentState]) -> list[pb.AgentSta
 
 
 class _StateTable:
-    """All states of the request's agents, one a row, and what is wrong with them."""
+    """States of the request's agents, one per row, and their faults."""
 
     def __init__(self, agents: Ints, counts: Ints, values: Floats, present: Bools, time: float) -> None:
         """
         Args:
-            agents: [W], indices in the request.
-            counts: [W], states of each.
-            values: [M, 9], in the order of the agents.
-            present: [M, 9].
-            time: the present, s.
+            agents: indices of W agents in the request: [W].
+            counts: number of states of each: [W].
+            values: the values of all states, in the order of the agents: [M, 9].
+            present: the presence of the values: [M, 9].
+            time: current time, s.
         """
         self._agents = agents
         self._counts = counts
@@ -203,10 +350,10 @@ class _StateTable:
         self._starts = np.cumsum(counts) - counts
         self._owner = np.repeat(np.arange(len(agents)), counts)
         self.faults: dict[int, Fault] = {}
-        """By index in the request; one an agent."""
+        """First fault of each agent, by index in the request."""
 
     def find_faults(self) -> None:
-        """Fills ``faults``: contents of single states, then pairs, then what holds between states."""
+        """Fill ``faults``: first those of single values, then of pairs, then between states."""
         values, present = self._values, self._present
         required = np.zeros(len(_FIELDS), dtype=np.bool_)
         required[_REQUIRED] = True
@@ -227,10 +374,10 @@ class _StateTable:
             self._find_jumps()
 
     def observations(self, faults: dict[int, Fault]) -> Observations:
-        """What is known of the agents without faults, in order.
+        """Return the observations of the agents without faults, in order.
 
         Args:
-            faults: by index in the request, from wherever; some agent has none.
+            faults: all faults by index in the request; at least one agent has none.
         """
         kept = np.array([index not in faults for index in self._agents.tolist()], dtype=np.bool_)
         counts = self._counts[kept]
@@ -251,11 +398,12 @@ class _StateTable:
         )
 
     def _first_of_each(self, rows: Ints) -> list[int]:
-        """The first of these rows of each agent that has no fault yet: only one an agent is told, and to
-        put a hundred thousand into words takes a quarter of a second.
+        """Return the first of the rows of each agent without a fault so far.
+
+        Only one fault per agent is reported, and formatting a hundred thousand takes a quarter of a second.
 
         Args:
-            rows: [R], ascending.
+            rows: ascending row indices: [R].
         """
         owners, firsts = np.unique(self._owner[rows], return_index=True)
         unknown = [int(agent) not in self.faults for agent in self._agents[owners]]
@@ -276,14 +424,14 @@ class _StateTable:
         return f"must be within ±{_BOUNDS[column]:g}"
 
     def _successive(self) -> Ints:
-        """Rows that have a predecessor in the same agent."""
+        """Return the rows that have a predecessor of the same agent."""
         return np.flatnonzero(self._owner[1:] == self._owner[:-1]) + 1
 
     def _find_time_faults(self) -> None:
         times = self._values[:, _TIME]
         for row in self._first_of_each(np.flatnonzero(times > self._now + TIME_TOLERANCE)):
             self._add(row, "time", f"is {times[row] - self._now:.3g} s after the request's time")
-        # Within the tolerance of the present an observation counts as of the present.
+        # An observation within the tolerance of the current time counts as current.
         np.minimum(times, self._now, out=times)
         after = self._successive()
         for row in self._first_of_each(after[times[after] <= times[after - 1]]):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.arrays import Bytes
 from service.errors import BadField
-from service.predict.images import decode_layers
+from service.predict.map_image import decode_layers
 from tests.service.requests import pack, png
 from tests.service.timing import cpu_seconds
 
