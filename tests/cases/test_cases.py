@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
-from _pytest.mark import ParameterSet
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
@@ -26,7 +25,7 @@ SCENARIOS = {one.name: one for one in scenes.at_poses(scenes.all_rows())}
 DRIVES = {one.name: one for one in driving.drives()}
 
 
-def known(asked: str, names: Iterable[str]) -> list[ParameterSet]:
+def known(asked: str, names: Iterable[str]) -> list[pytest.ParameterSet]:
     """Return parameters, those that are known to be out of their bands expected to fail."""
     fails = pytest.mark.xfail(strict=True, raises=AssertionError, reason="known to be out of its band")
     return [pytest.param(name, marks=[fails] if name in OUTSIDE[asked] else []) for name in names]
