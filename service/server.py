@@ -15,8 +15,7 @@ from service.predict.pipeline import DataPlane
 from service.settings import Settings, SettingsError, bundled_models
 from service.telemetry.metrics import Metrics
 from service.transports.grpc.server import GrpcServer
-from service.transports.rest.app import build_app
-from service.transports.rest.server import HttpServer
+from service.transports.rest.server import HttpServer, build_app
 
 _log = structlog.get_logger(__name__)
 

@@ -1,1 +1,1 @@
-"""Transports. Each is thin: it carries messages to the data plane and answers or errors back."""
+"""REST and gRPC transports. They decode requests, call the pipeline, and encode responses and errors."""

@@ -1,4 +1,4 @@
-"""Who may call."""
+"""Bearer token authentication, the same on both transports."""
 
 import hmac
 from collections.abc import Sequence
@@ -11,19 +11,19 @@ _SCHEME = "bearer"
 
 
 class Tokens:
-    """The bearer tokens that are let in; none of them: everyone is."""
+    """The accepted bearer tokens. Without any, authentication is off."""
 
     def __init__(self, tokens: Sequence[SecretStr]) -> None:
         self._tokens = [token.get_secret_value().encode() for token in tokens]
 
     def check(self, authorization: str | None) -> None:
-        """Lets a call in, or not.
+        """Refuse a call without a valid token.
 
         Args:
-            authorization: the header of that name, if there is one.
+            authorization: the Authorization header; None: there is none.
 
         Raises:
-            Unauthenticated: credentials are needed and these do not do.
+            Unauthenticated: the token is missing or not accepted.
         """
         if not self._tokens:
             return
@@ -31,7 +31,7 @@ class Tokens:
             raise Unauthenticated('credentials are missing: send "authorization: Bearer <token>"')
         scheme, _, token = authorization.partition(" ")
         given = token.strip().encode("utf-8", "surrogateescape")
-        # All are compared, each in constant time: the answer's timing tells nothing of them
-        known = [hmac.compare_digest(given, expected) for expected in self._tokens]
-        if scheme.lower() != _SCHEME or not any(known):
-            raise Unauthenticated("these credentials are not known here")
+        # Compare with all tokens, each in constant time, so that the timing reveals nothing about them.
+        matches = [hmac.compare_digest(given, accepted) for accepted in self._tokens]
+        if scheme.lower() != _SCHEME or not any(matches):
+            raise Unauthenticated("the credentials are not valid")

@@ -1,54 +1,129 @@
-"""The contract's services as gRPC handlers."""
+"""gRPC handlers of the contract's methods.
 
+The handlers take and return bytes. A request that is too large or malformed therefore fails like any other
+bad request, with error details, and not without details inside gRPC.
+
+gRPC cancels a handler when the client disconnects or its deadline passes, which removes the call from any
+queue that it waits in.
+"""
+
+import asyncio
 import functools
-from contextlib import ExitStack
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import ExitStack, asynccontextmanager
+from typing import Any
 
 import grpc
 from google.protobuf.message import Message
+from grpc import aio
 
-from cab.forecast.v1 import model_service_pb2 as models_pb
-from cab.forecast.v1 import prediction_service_pb2 as pb
+from cab.forecast.v1.consistency_service_pb2 import WatchSceneRequest
+from cab.forecast.v1.routes import PREDICT, SERVICES, WATCH_SCENE, Request, Response, Route
+from service.errors import TooLarge
 from service.predict.pipeline import DataPlane
 from service.predict.request_reader import LARGE_BYTES, EncodedRequest, RequestLimits, read_protobuf
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
-from service.transports.grpc.calls import Calls, Context
-from service.transports.grpc.consistency import CONSISTENCY_SERVICE, ConsistencyHandlers
+from service.transports.calls import UNARY_METHODS, parse_message, record_call
+from service.transports.grpc.status import abort
+from service.transports.streams import closing
 
-PREDICTION_SERVICE = pb.DESCRIPTOR.services_by_name["PredictionService"].full_name
-MODEL_SERVICE = models_pb.DESCRIPTOR.services_by_name["ModelService"].full_name
-SERVICES = (PREDICTION_SERVICE, MODEL_SERVICE, CONSISTENCY_SERVICE)
-"""Full names of all."""
+Context = Any  # grpc.aio.ServicerContext is generic in the message types, which are bytes here
 
 
 class Handlers:
-    """What each method calls."""
+    """The contract's methods as gRPC handlers."""
 
     def __init__(self, dataplane: DataPlane, metrics: Metrics, settings: Settings) -> None:
         self._dataplane = dataplane
-        self._calls = Calls(metrics, settings)
-        self._consistency = ConsistencyHandlers(dataplane, self._calls)
+        self._metrics = metrics
+        self._max_bytes = settings.max_request_bytes
         self._read_request = functools.partial(read_protobuf, limits=RequestLimits.from_settings(settings))
 
     def generic(self) -> "list[grpc.GenericRpcHandler[bytes, bytes]]":
-        """For ``server.add_generic_rpc_handlers``."""
-        handlers = {
-            PREDICTION_SERVICE: {"Predict": self._calls.raw("Predict", self._predict)},
-            MODEL_SERVICE: self._of_models(),
-            CONSISTENCY_SERVICE: self._consistency.methods(),
+        """Return handlers for ``server.add_generic_rpc_handlers``, one per service."""
+        handlers: dict[Route[Any, Any], grpc.RpcMethodHandler[bytes, bytes]] = {
+            PREDICT: self._bytes(PREDICT, self._predict),
+            WATCH_SCENE: self._stream(WATCH_SCENE, self._watch_scene),
         }
-        return [grpc.method_handlers_generic_handler(name, handlers[name]) for name in SERVICES]
+        for route, execute in UNARY_METHODS.items():
+            handlers[route] = self._unary(route, functools.partial(execute, self._dataplane))
+        return [
+            grpc.method_handlers_generic_handler(
+                service,
+                {route.method: handler for route, handler in handlers.items() if route.service == service},
+            )
+            for service in SERVICES
+        ]
 
     async def _predict(self, body: bytes, context: Context) -> Message:
-        held = ExitStack()
-        call = held.enter_context(self._dataplane.accept(context.time_remaining()))
-        # Not when this returns: the answer is yet to be sent, however slowly the client takes it
-        context.add_done_callback(lambda _: held.close())
+        # The call counts as in progress until the response was sent, not only until this returns.
+        stack = ExitStack()
+        call = stack.enter_context(self._dataplane.accept(context.time_remaining()))
+        context.add_done_callback(lambda _: stack.close())
         return await self._dataplane.predict(EncodedRequest(body, self._read_request, LARGE_BYTES), call)
 
-    def _of_models(self) -> "dict[str, grpc.RpcMethodHandler[bytes, bytes]]":
-        unary, plane = self._calls.unary, self._dataplane
-        return {
-            "ListModels": unary("ListModels", models_pb.ListModelsRequest, plane.list_models),
-            "GetModel": unary("GetModel", models_pb.GetModelRequest, plane.get_model),
-        }
+    def _watch_scene(self, request: WatchSceneRequest) -> AsyncIterator[Message]:
+        return self._dataplane.consistency.watch_scene(request)
+
+    def _bytes(
+        self, route: Route[Any, Any], behavior: Callable[[bytes, Context], Awaitable[Message]]
+    ) -> "grpc.RpcMethodHandler[bytes, bytes]":
+        """Return the handler of a method that parses its request itself."""
+
+        async def handle(body: bytes, context: Context) -> bytes:
+            async with self._recorded(route, body, context):
+                return (await behavior(body, context)).SerializeToString()
+
+        return grpc.unary_unary_rpc_method_handler(handle)
+
+    def _unary(
+        self, route: Route[Request, Response], behavior: Callable[[Request], Awaitable[Message]]
+    ) -> "grpc.RpcMethodHandler[bytes, bytes]":
+        """Return the handler of a method with small requests."""
+
+        async def parse_and_execute(body: bytes, _: Context) -> Message:
+            return await behavior(parse_message(route.request, body))
+
+        return self._bytes(route, parse_and_execute)
+
+    def _stream(
+        self, route: Route[Request, Response], behavior: Callable[[Request], AsyncIterator[Message]]
+    ) -> "grpc.RpcMethodHandler[bytes, bytes]":
+        """Return the handler of a method that responds with a stream."""
+
+        async def handle(body: bytes, context: Context) -> None:
+            async with self._recorded(route, body, context):
+                events = behavior(parse_message(route.request, body))
+                async with closing(events):
+                    async for event in events:
+                        await _send(context, event)
+
+        return grpc.unary_stream_rpc_method_handler(handle)
+
+    @asynccontextmanager
+    async def _recorded(self, route: Route[Any, Any], body: bytes, context: Context) -> AsyncIterator[None]:
+        """Record a call, bound its size, and turn exceptions into a status with details."""
+        with record_call(self._metrics, "grpc", route.method, timed=not route.streaming) as recorder:
+            try:
+                if len(body) > self._max_bytes:
+                    raise TooLarge(
+                        f"the request has {len(body)} bytes; at most {self._max_bytes} are accepted"
+                    )
+                yield
+            except Exception as exception:
+                await abort(context, recorder.failed(exception))
+                raise  # unreachable: abort raises
+            recorder.succeeded()
+
+
+async def _send(context: Context, message: Message) -> None:
+    """Send one message of a stream.
+
+    Raises:
+        CancelledError: the client disconnected; gRPC notices this in a write before it cancels the call.
+    """
+    try:
+        await context.write(message.SerializeToString())
+    except aio.InternalError as error:
+        raise asyncio.CancelledError from error

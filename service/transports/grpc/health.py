@@ -1,4 +1,4 @@
-"""grpc.health.v1: whether the services take calls, asked once or watched."""
+"""Health service, grpc.health.v1: unary checks and watches."""
 
 import asyncio
 from collections.abc import Sequence
@@ -12,9 +12,9 @@ _Status = health_pb2.HealthCheckResponse
 
 
 class Health(health_pb2_grpc.HealthServicer):  # type: ignore[misc]  # has no types
-    """The health of "" and of each service; all of them go together.
+    """Health of "" and of each service; all share one status.
 
-    gRPC's own servicer never ends a watch, and a server that waits for its calls would wait for that.
+    gRPC's own servicer never ends a watch, and would keep a stopping server waiting for its watches.
     """
 
     def __init__(self, services: Sequence[str]) -> None:
@@ -24,30 +24,30 @@ class Health(health_pb2_grpc.HealthServicer):  # type: ignore[misc]  # has no ty
         self._changed = asyncio.Event()
 
     def set_serving(self, serving: bool) -> None:
-        """Tells everyone who asks or watches."""
+        """Set the status and notify the watches."""
         self._serving = serving
         self._notify()
 
     def close(self) -> None:
-        """Ends the watches, once they have told what there is to tell."""
+        """End the watches after they sent the latest status."""
         self._closed = True
         self._notify()
 
     async def Check(self, request: Any, context: Any) -> Any:  # noqa: N802 - the contract's name
-        """The health now."""
+        """Return the current status."""
         if request.service not in self._services:
             await context.abort(grpc.StatusCode.NOT_FOUND, "no such service")
         return _Status(status=self._status(request.service))
 
     async def Watch(self, request: Any, context: Any) -> None:  # noqa: N802
-        """The health now and whenever it changes."""
-        told = None
+        """Send the current status, and each change of it."""
+        sent = None
         while True:
             changed = self._changed
             status = self._status(request.service)
-            if status != told:
+            if status != sent:
                 await context.write(_Status(status=status))
-                told = status
+                sent = status
             elif self._closed:
                 await context.abort(grpc.StatusCode.UNAVAILABLE, "the server is stopping")
             else:

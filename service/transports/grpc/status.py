@@ -1,4 +1,4 @@
-"""Errors as google.rpc.Status with details."""
+"""Errors as google.rpc.Status with details; the counterpart of REST's problem documents."""
 
 from collections.abc import Sequence
 
@@ -10,16 +10,17 @@ from google.rpc import error_details_pb2, status_pb2
 from service.errors import DOMAIN, Fault, ServiceError
 
 DETAILS_KEY = "grpc-status-details-bin"
-"""Trailing metadata that carries the status."""
+"""Key of the trailing metadata that carries the status."""
 _MAX_VIOLATION_BYTES = 4096
-"""Violations listed, encoded: metadata is limited to 8 KiB by default, and the first few dozens of faults
-tell what is going on."""
+"""Encoded size at which the list of violations ends. gRPC limits metadata to 8 KiB by default, and the first
+few dozen violations are enough to find the cause."""
 _MAX_TEXT = 200
-"""Characters of any text that may hold what the client sent."""
+"""Characters; longer texts are cut, because they may quote what the client sent."""
 
 
 def to_status(error: ServiceError) -> status_pb2.Status:
-    """The status of an error: ErrorInfo always, BadRequest with faults, RetryInfo when a retry helps."""
+    """Return the status of an error: always with ErrorInfo, with BadRequest if fields are wrong, and with
+    RetryInfo if a retry may succeed."""
     details = [_pack(error_details_pb2.ErrorInfo(reason=error.reason, domain=DOMAIN))]
     if error.faults:
         details.append(_pack(_bad_request(error.faults)))
@@ -32,14 +33,14 @@ def to_status(error: ServiceError) -> status_pb2.Status:
 
 
 async def abort(context: "grpc.aio.ServicerContext[object, object]", error: ServiceError) -> None:
-    """Ends a call with an error; raises, as ``context.abort`` does."""
+    """End a call with an error. Raises, as ``context.abort`` does."""
     status = to_status(error)
     metadata = ((DETAILS_KEY, status.SerializeToString()),)
     await context.abort(grpc.StatusCode[error.code], status.message, metadata)
 
 
 def _bad_request(faults: Sequence[Fault]) -> error_details_pb2.BadRequest:
-    """As many of the faults as there is room for, at least one."""
+    """Return as many of the faults as there is room for, at least one."""
     message = error_details_pb2.BadRequest()
     for fault in faults:
         message.field_violations.add(field=fault.field[:_MAX_TEXT], description=fault.detail[:_MAX_TEXT])

@@ -1,9 +1,13 @@
-"""The contract's messages as JSON, by protobuf's JSON mapping.
+"""JSON codec of the contract's messages, by protobuf's JSON mapping.
 
-Reading is protobuf's own ``ParseDict``: camelCase and snake_case names, numbers as strings, base64 bytes.
-Writing is our own: a forecast is tens of thousands of numbers, over which ``MessageToDict`` takes one at
-a time. Names are written in snake_case, and every field that has a default is written, so that a reader
-finds each key.
+Reading uses protobuf's ``ParseDict``: camelCase and snake_case names, numbers as strings, base64 bytes.
+Predict requests are the exception. ``ParseDict`` takes ten microseconds per number, and a request has up to
+a million of them, nearly all in states. States of plain numbers, which are the common case, are therefore
+constructed directly, and ``ParseDict`` reads the rest of the request.
+
+Writing does not use ``MessageToDict``, which is slow for the tens of thousands of numbers of a forecast.
+Names are written in snake_case, and fields with default values are written too, so that readers find every
+key.
 """
 
 import base64
@@ -17,48 +21,66 @@ import orjson
 from google.protobuf import json_format
 from google.protobuf.descriptor import Descriptor, EnumDescriptor, FieldDescriptor
 from google.protobuf.message import Message
+from starlette.datastructures import QueryParams
 
-from service.errors import BadField
+from cab.forecast.v1 import prediction_service_pb2 as pb
+from service.errors import BadField, TooLarge
+from service.predict.request_reader import RequestLimits
 
 _M = TypeVar("_M", bound=Message)
 _Encoder = Callable[[Any], Any]
 
 _FIELD_IN_ERROR = re.compile(r"Failed to parse (\w+) field")
 _PATH_IN_ERROR = re.compile(r' at "?\w+((?:\.\w+(?:\[\d+\])?)*)"?\.*$')
-_MAX_REASON = 200
-_MAX_TEXT = 4000
 _UNKNOWN_IN_ERROR = re.compile(r'has no field named "(.{0,64}?)" at "\w+((?:\.\w+(?:\[\d+\])?)*)"', re.DOTALL)
+_MAX_REASON = 200
+"""Characters of a reason that are sent to the client."""
+_MAX_TEXT = 4000
+"""Characters of a ParseError's text that are searched."""
+
+_AGENTS = pb.PredictRequest.DESCRIPTOR.fields_by_number[pb.PredictRequest.AGENTS_FIELD_NUMBER].name
+_STATES = pb.Agent.DESCRIPTOR.fields_by_number[pb.Agent.STATES_FIELD_NUMBER].name
+_STATE_FIELDS = {
+    spelling: field.name
+    for field in pb.AgentState.DESCRIPTOR.fields
+    for spelling in (field.name, field.json_name)
+}
+_BRACKETS_PER_AGENT = 256
+"""Objects and lists of an agent besides its states, plus brackets in its id."""
+_VALUES_PER_AGENT = 512
+"""Values of an agent besides those of its states, plus commas in its id."""
+_VALUES_PER_STATE = len(pb.AgentState.DESCRIPTOR.fields)
 
 
 def parse_json(message_type: type[_M], body: bytes) -> _M:
-    """A message from JSON.
+    """Parse a message from JSON.
 
     Raises:
-        BadField: it is no JSON, or not of that message; names the field as far as it can be told.
+        BadField: the body is not valid JSON or not a valid message; names the field if it is known.
     """
     return from_document(message_type, load_document(body))
 
 
 def load_document(body: bytes) -> dict[str, Any]:
-    """A JSON object.
+    """Parse a JSON object.
 
     Raises:
-        BadField: it is none.
+        BadField: the body is not a JSON object.
     """
     try:
         document = orjson.loads(body)
     except orjson.JSONDecodeError as error:
-        raise BadField("body", f"is no JSON: {error}") from error
+        raise BadField("body", f"is not valid JSON: {error}") from error
     if not isinstance(document, dict):
         raise BadField("body", "must be a JSON object")
     return document
 
 
 def from_document(message_type: type[_M], document: dict[str, Any]) -> _M:
-    """A message from a JSON object.
+    """Return the message that a JSON object describes.
 
     Raises:
-        BadField: it is not of that message; names the field as far as it can be told.
+        BadField: the object is not a valid message; names the field if it is known.
     """
     message = message_type()
     try:
@@ -66,21 +88,55 @@ def from_document(message_type: type[_M], document: dict[str, Any]) -> _M:
     except json_format.ParseError as error:
         raise _fault(str(error)) from error
     except (ValueError, TypeError, AttributeError, KeyError, ArithmeticError, RecursionError) as error:
-        # What ParseDict lets through where a value is of a kind it did not think of
+        # ParseDict does not check all types itself.
         raise BadField(
-            "body", f"is no {message_type.DESCRIPTOR.name}: a value is of the wrong kind"
+            "body", f"is not a valid {message_type.DESCRIPTOR.name}: a value has the wrong type"
         ) from error
     return message
 
 
+def read_query(message_type: type[_M], parameters: QueryParams) -> _M:
+    """Return the message, of scalar fields, that the query of a URL describes.
+
+    Raises:
+        BadField: a parameter is unknown, repeated or invalid; names it.
+    """
+    document: dict[str, str] = {}
+    for name, value in parameters.multi_items():
+        if name in document:
+            raise BadField(name, "is given more than once")
+        document[name] = value
+    return from_document(message_type, document)
+
+
+def read_request(body: bytes, limits: RequestLimits) -> pb.PredictRequest:
+    """Parse a Predict request from JSON.
+
+    Raises:
+        TooLarge: the request has more agents or states than allowed.
+        BadField: the body is not a valid request; names the field if it is known.
+    """
+    _check_body(body, limits)
+    document = load_document(body)
+    _check_document(document, limits)
+    states = _pop_plain_states(document)
+    request = from_document(pb.PredictRequest, document)
+    for index, plain in states.items():
+        request.agents[index].states.extend(plain)
+    return request
+
+
 def to_json(message: Message) -> bytes:
-    """A message as JSON."""
+    """Serialize a message to JSON."""
     return orjson.dumps(to_dict(message), option=orjson.OPT_NON_STR_KEYS)
 
 
 def to_dict(message: Message) -> dict[str, Any]:
-    """A message as JSON's types: what ``MessageToDict`` gives with proto field names and with fields
-    without presence always printed."""
+    """Convert a message to JSON types.
+
+    The result equals ``MessageToDict`` with ``preserving_proto_field_name`` and
+    ``always_print_fields_with_no_presence``.
+    """
     encoded: dict[str, Any] = {}
     for name, has_presence, encode in _fields(message.DESCRIPTOR):
         if not has_presence or message.HasField(name):
@@ -88,9 +144,65 @@ def to_dict(message: Message) -> dict[str, Any]:
     return encoded
 
 
+def _check_body(body: bytes, limits: RequestLimits) -> None:
+    """Bound the memory of the parsed JSON, which can be twenty times the size of the text.
+
+    Raises:
+        TooLarge: the text has more objects or values than a request within the limits can have.
+    """
+    if body.count(b"{") + body.count(b"[") > limits.states + _BRACKETS_PER_AGENT * (limits.agents + 1):
+        raise TooLarge(
+            f"more objects and lists than {limits.agents} agents and {limits.states} states can have"
+        )
+    if body.count(b",") > limits.states * _VALUES_PER_STATE + _VALUES_PER_AGENT * (limits.agents + 1):
+        raise TooLarge(f"more values than {limits.agents} agents and {limits.states} states can have")
+
+
+def _check_document(document: dict[str, Any], limits: RequestLimits) -> None:
+    agents = document.get(_AGENTS)
+    if not isinstance(agents, list):
+        return
+    limits.check_agents(len(agents))
+    states = [agent[_STATES] for agent in agents if isinstance(agent, dict) and _STATES in agent]
+    limits.check_states(sum(len(each) for each in states if isinstance(each, list)))
+
+
+def _pop_plain_states(document: dict[str, Any]) -> dict[int, list[pb.AgentState]]:
+    """Remove the states of agents whose states are all plain; return them by index of the agent."""
+    popped: dict[int, list[pb.AgentState]] = {}
+    agents = document.get(_AGENTS)
+    for index, agent in enumerate(agents if isinstance(agents, list) else ()):
+        states = agent.get(_STATES) if isinstance(agent, dict) else None
+        if not isinstance(states, list):
+            continue
+        plain = _plain_states(states)
+        if plain is not None:
+            del agent[_STATES]
+            popped[index] = plain
+    return popped
+
+
+def _plain_states(states: list[Any]) -> list[pb.AgentState] | None:
+    """Return the states; None if any of them is not plain numbers, which ``ParseDict`` reads or refuses."""
+    plain = []
+    for state in states:
+        if not isinstance(state, dict):
+            return None
+        values: dict[str, float] = {}
+        for spelling, value in state.items():
+            name = _STATE_FIELDS.get(spelling)
+            if (
+                name is None or name in values or type(value) not in (float, int)
+            ):  # not isinstance: a bool is an int
+                return None
+            values[name] = value
+        plain.append(pb.AgentState(**values))
+    return plain
+
+
 def _fault(text: str) -> BadField:
-    """The field that a ParseError is about, and why, from its text."""
-    if len(text) > _MAX_TEXT:  # the value that is wrong may be megabytes
+    """Return the field and the reason that the text of a ParseError gives."""
+    if len(text) > _MAX_TEXT:  # it may quote a value of megabytes
         text = text[: _MAX_TEXT // 2] + text[-_MAX_TEXT // 2 :]
     text = text.split("\n", 1)[0]
     unknown = _UNKNOWN_IN_ERROR.search(text)
@@ -101,9 +213,9 @@ def _fault(text: str) -> BadField:
     places = path[1].strip(".").split(".") if path and path[1] else []
     field = _snake(".".join([*places, *names[len(places) :]])) or "body"
     reason = (text[: path.start()] if path else text).rpartition(" field: ")[2].rstrip(".")
-    # Without a path the text is of a Python exception inside ParseDict, which says nothing to a client
+    # Without a path the text comes from a Python exception inside ParseDict, which does not help a client.
     if path is None and not reason.startswith("Value out of range"):
-        reason = "is of the wrong kind"
+        reason = "has the wrong type"
     return BadField(field, reason[:_MAX_REASON])
 
 
@@ -113,7 +225,7 @@ def _snake(path: str) -> str:
 
 @functools.cache
 def _fields(descriptor: Descriptor) -> tuple[tuple[str, bool, _Encoder], ...]:
-    """For each field of a message: name, whether it knows if it was set, and how a value is written."""
+    """Return, for each field of a message: its name, whether it has presence, and its encoder."""
     return tuple((field.name, field.has_presence, _encoder(field)) for field in descriptor.fields)
 
 
@@ -133,7 +245,7 @@ def _encoder(field: FieldDescriptor) -> _Encoder:
 
 def _floats(values: Any, single: _Encoder) -> list[Any]:
     numbers = list(values)
-    # One addition each tells whether all are finite (or huge: then they are looked at one by one)
+    # A finite sum means that all are finite. An infinite one may also be an overflow: check each number.
     if single is _double and math.isfinite(sum(numbers)):
         return numbers
     return [single(number) for number in numbers]

@@ -1,61 +1,291 @@
-"""Forecasts and models over HTTP."""
+"""REST endpoints of the contract's methods: from the HTTP request to the HTTP response."""
 
 import asyncio
 import functools
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import ExitStack, aclosing
+from typing import Any, TypeVar
 
-from starlette.requests import Request
+import orjson
+from google.protobuf.message import Message
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
+from starlette.types import ASGIApp, Receive, Scope, Send
 
-from cab.forecast.v1 import model_service_pb2 as models_pb
+from cab.forecast.v1.routes import MODEL_SERVICE, PREDICT, WATCH_SCENE, Route
+from service.errors import TooLarge
 from service.predict.pipeline import DataPlane
 from service.predict.request_reader import LARGE_BYTES, EncodedRequest, RequestLimits, read_protobuf
 from service.settings import Settings
-from service.transports.rest import json_request
-from service.transports.rest.calls import Calls, respond, unless_disconnected
-from service.transports.rest.negotiation import Format, answer_format, request_format, timeout
-from service.transports.rest.sending import held
+from service.telemetry.metrics import Metrics
+from service.transports.auth import Tokens
+from service.transports.calls import UNARY_METHODS, CallRecorder, parse_message, record_call
+from service.transports.rest.codec import parse_json, read_query, read_request, to_json
+from service.transports.rest.negotiation import (
+    EVENT_STREAM,
+    Format,
+    check_events_accepted,
+    request_format,
+    response_format,
+    timeout,
+)
+from service.transports.rest.problem import problem_response, to_problem
+from service.transports.streams import with_idle_ticks
+
+HEARTBEAT = 15.0
+"""Seconds without an event after which a comment tells client and proxies that the stream is alive."""
+_SMALL_BYTES = 2**16
+"""Limit of requests that hold no more than an id; they are parsed on the event loop."""
+_CLIENT_CLOSED_REQUEST = 499
+"""Status of a response that is never sent, because the client has disconnected."""
+_EVENT_HEADERS = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}  # keep proxies from buffering
+_EXIT_STACK = "forecast.exit_stack"
+"""Key of the exit stack in the ASGI scope."""
+
+_T = TypeVar("_T")
+Endpoint = Callable[[Request], Awaitable[Response]]
 
 
 class Endpoints:
-    """The handlers of ``/v1/predict`` and ``/v1/models``."""
+    """The contract's methods as Starlette endpoints."""
 
-    def __init__(self, dataplane: DataPlane, calls: Calls, settings: Settings) -> None:
+    def __init__(self, dataplane: DataPlane, metrics: Metrics, settings: Settings) -> None:
         self._dataplane = dataplane
-        self._calls = calls
+        self._metrics = metrics
+        self._tokens = Tokens(settings.api_tokens)
+        self._max_bytes = settings.max_request_bytes
         self._limits = RequestLimits.from_settings(settings)
 
-    async def predict(self, request: Request) -> Response:
-        """POST /v1/predict."""
-        return await self._calls.answer("Predict", request, self._predict)
+    def by_route(self) -> dict[Route[Any, Any], Endpoint]:
+        """Return the endpoint of each route."""
+        endpoints: dict[Route[Any, Any], Endpoint] = {
+            PREDICT: self._recorded(PREDICT, self._predict),
+            WATCH_SCENE: self._watch_scene,
+        }
+        for route in UNARY_METHODS:
+            endpoints[route] = self._recorded(route, functools.partial(self._execute, route))
+        return endpoints
 
-    async def list_models(self, request: Request) -> Response:
-        """GET /v1/models."""
-        return await self._calls.answer("ListModels", request, self._list_models)
+    def _recorded(self, route: Route[Any, Any], behavior: Endpoint) -> Endpoint:
+        """Return an endpoint that authenticates, records the call, and responds to errors with a problem."""
 
-    async def get_model(self, request: Request) -> Response:
-        """GET /v1/models/{name}."""
-        return await self._calls.answer("GetModel", request, self._get_model)
+        async def endpoint(request: Request) -> Response:
+            with record_call(self._metrics, "rest", route.method) as recorder:
+                try:
+                    self._tokens.check(request.headers.get("authorization"))
+                    response = await behavior(request)
+                except ClientDisconnect:
+                    recorder.cancelled()
+                    return Response(status_code=_CLIENT_CLOSED_REQUEST)
+                except Exception as exception:
+                    return problem_response(recorder.failed(exception))
+                recorder.succeeded()
+                return response
+
+        return endpoint
 
     async def _predict(self, request: Request) -> Response:
         incoming = request_format(request.headers)
-        outgoing = answer_format(request.headers, preferred=incoming)
-        call = held(request).enter_context(self._dataplane.accept(timeout(request.headers)))
+        outgoing = response_format(request.headers, preferred=incoming)
+        # The call counts as in progress until the response was sent, not only until this returns.
+        call = exit_stack(request).enter_context(self._dataplane.accept(timeout(request.headers)))
         async with call.in_time():
-            body = await self._calls.read_body(request)
-        encoded = self._encoded(body, incoming)
-        answer = await unless_disconnected(request.receive, self._dataplane.predict(encoded, call))
-        return await asyncio.to_thread(respond, answer, outgoing)
+            body = await self._read_body(request, self._max_bytes)
+        if incoming is Format.JSON:  # always slow enough to be parsed in a thread
+            encoded = EncodedRequest(body, functools.partial(read_request, limits=self._limits))
+        else:
+            read = functools.partial(read_protobuf, limits=self._limits)
+            encoded = EncodedRequest(body, read, LARGE_BYTES)
+        message = await cancel_on_disconnect(request.receive, self._dataplane.predict(encoded, call))
+        return await asyncio.to_thread(_message_response, message, outgoing)
 
-    async def _list_models(self, request: Request) -> Response:
-        outgoing = answer_format(request.headers, preferred=Format.JSON)
-        return respond(await self._dataplane.list_models(models_pb.ListModelsRequest()), outgoing)
+    async def _execute(self, route: Route[Any, Any], request: Request) -> Response:
+        """Execute a unary method with small messages."""
+        incoming = request_format(request.headers) if route.verb == "POST" else Format.JSON
+        outgoing = response_format(request.headers, preferred=incoming)
+        if route.verb == "POST":
+            body = await self._read_body(request, min(_SMALL_BYTES, self._max_bytes))
+            parse = parse_json if incoming is Format.JSON else parse_message
+            message = parse(route.request, body)
+        elif route.service == MODEL_SERVICE:  # these ignore the query
+            message = route.request(**request.path_params)
+        else:
+            message = read_query(route.request, request.query_params)
+        return _message_response(await UNARY_METHODS[route](self._dataplane, message), outgoing)
 
-    async def _get_model(self, request: Request) -> Response:
-        outgoing = answer_format(request.headers, preferred=Format.JSON)
-        name: str = request.path_params["name"]
-        return respond(await self._dataplane.get_model(models_pb.GetModelRequest(name=name)), outgoing)
+    async def _watch_scene(self, request: Request) -> Response:
+        def events() -> AsyncIterator[Message]:
+            message = read_query(WATCH_SCENE.request, request.query_params)
+            return self._dataplane.consistency.watch_scene(message)
 
-    def _encoded(self, body: bytes, incoming: Format) -> EncodedRequest:
-        if incoming is Format.JSON:  # never quick
-            return EncodedRequest(body, functools.partial(json_request.read_request, limits=self._limits))
-        return EncodedRequest(body, functools.partial(read_protobuf, limits=self._limits), LARGE_BYTES)
+        return EventStreamResponse(self._metrics, self._tokens, WATCH_SCENE.method, request, events)
+
+    @staticmethod
+    async def _read_body(request: Request, max_bytes: int) -> bytes:
+        """Return the body; refuse one that is too large as soon as that is known.
+
+        Raises:
+            TooLarge: the body exceeds the limit, by its Content-Length or as it is received.
+        """
+        too_large = TooLarge(f"the body has more than {max_bytes} bytes")
+        declared = request.headers.get("content-length", "")
+        if declared.isdecimal() and int(declared) > max_bytes:
+            raise too_large
+        body = bytearray()
+        async for chunk in request.stream():
+            body += chunk
+            if len(body) > max_bytes:
+                raise too_large
+        return bytes(body)
+
+
+class EventStreamResponse(Response):
+    """A stream of messages as Server-Sent Events, ``data: <message as JSON>`` each.
+
+    The stream ends with its messages, after the time that the request's header gives, or when the client
+    disconnects. An error before the first event is a problem response, as in any call; a later one is sent
+    as a last event of the type ``error``, with the problem as its data.
+    """
+
+    media_type = EVENT_STREAM
+
+    def __init__(
+        self,
+        metrics: Metrics,
+        tokens: Tokens,
+        method: str,
+        request: Request,
+        events: Callable[[], AsyncIterator[Message]],
+    ) -> None:
+        """
+        Args:
+            metrics: records the call.
+            tokens: authenticate it.
+            method: name of the contract's method.
+            request: the HTTP request.
+            events: opens the stream of messages; the headers are sent with the first one.
+        """
+        self.status_code = 200
+        self.init_headers(_EVENT_HEADERS)
+        self._metrics = metrics
+        self._tokens = tokens
+        self._method = method
+        self._request = request
+        self._events = events
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve the request to its end."""
+        with record_call(self._metrics, "rest", self._method, timed=False) as recorder:
+            writer = _BodyWriter(send, self.raw_headers)
+            try:
+                problem = await cancel_on_disconnect(receive, self._serve(recorder, writer))
+            except ClientDisconnect:
+                recorder.cancelled()
+                return
+            if problem is not None:
+                await problem(scope, receive, send)
+
+    async def _serve(self, recorder: CallRecorder, writer: "_BodyWriter") -> Response | None:
+        """Send all events. Return a problem response if the call fails before the first one."""
+        try:
+            await self._send_events(writer)
+        except Exception as exception:
+            error = recorder.failed(exception)
+            if not writer.started:
+                return problem_response(error)
+            await writer.write(b"event: error\ndata: " + orjson.dumps(to_problem(error)) + b"\n\n")
+        else:
+            recorder.succeeded()
+        await writer.end()
+        return None
+
+    async def _send_events(self, writer: "_BodyWriter") -> None:
+        headers = self._request.headers
+        self._tokens.check(headers.get("authorization"))
+        check_events_accepted(headers)
+        # HEAD asks for the headers only.
+        deadline = asyncio.timeout(0.0 if self._request.method == "HEAD" else timeout(headers))
+        try:
+            events = with_idle_ticks(self._events(), HEARTBEAT)
+            async with deadline, aclosing(events):
+                async for message in events:
+                    if message is None:
+                        await writer.write(b": heartbeat\n\n")
+                    else:
+                        await writer.write(b"data: " + to_json(message) + b"\n\n")
+        except TimeoutError:
+            if not deadline.expired():
+                raise
+
+
+class _BodyWriter:
+    """Writer of a response body that is sent piece by piece."""
+
+    def __init__(self, send: Send, headers: list[tuple[bytes, bytes]]) -> None:
+        self._send = send
+        self._headers = headers
+        self.started = False
+        """Whether the headers were sent."""
+
+    async def write(self, body: bytes, *, more: bool = True) -> None:
+        """Send a piece, and the headers before the first one."""
+        if not self.started:
+            self.started = True
+            await self._send({"type": "http.response.start", "status": 200, "headers": self._headers})
+        await self._send({"type": "http.response.body", "body": body, "more_body": more})
+
+    async def end(self) -> None:
+        """End the body."""
+        await self.write(b"", more=False)
+
+
+class ExitStackMiddleware:
+    """Middleware that gives each request an exit stack, closed after its response was sent."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request."""
+        with ExitStack() as stack:
+            scope[_EXIT_STACK] = stack
+            await self._app(scope, receive, send)
+
+
+def exit_stack(request: Request) -> ExitStack:
+    """Return the stack that is closed once the response to a request was sent."""
+    stack: ExitStack = request.scope[_EXIT_STACK]
+    return stack
+
+
+async def cancel_on_disconnect(receive: Receive, work: Awaitable[_T]) -> _T:
+    """Return the result of some work; cancel it if the client disconnects first.
+
+    Args:
+        receive: ASGI channel of a request whose body was read already.
+        work: the awaitable to run.
+
+    Raises:
+        ClientDisconnect: the client disconnected.
+    """
+    task = asyncio.ensure_future(work)
+    watch = asyncio.create_task(_wait_for_disconnect(receive))
+    try:
+        await asyncio.wait({task, watch}, return_when=asyncio.FIRST_COMPLETED)
+        if not task.done():
+            raise ClientDisconnect
+        return task.result()
+    finally:
+        task.cancel()
+        watch.cancel()
+        await asyncio.gather(task, watch, return_exceptions=True)
+
+
+async def _wait_for_disconnect(receive: Receive) -> None:
+    while (await receive())["type"] != "http.disconnect":
+        pass
+
+
+def _message_response(message: Message, outgoing: Format) -> Response:
+    body = to_json(message) if outgoing is Format.JSON else message.SerializeToString()
+    return Response(body, media_type=outgoing.value)

@@ -1,4 +1,4 @@
-"""Which media types come in and go out, and what else the headers of a request ask for."""
+"""Content negotiation: media types and timeouts from request headers."""
 
 import math
 from enum import StrEnum
@@ -8,30 +8,28 @@ from starlette.datastructures import Headers
 from service.errors import BadField, NotAcceptable, UnsupportedMediaType
 
 TIMEOUT_HEADER = "Request-Timeout"
-"""s that the client waits for the answer."""
-
-
-EVENTS = "text/event-stream"
-"""Server-Sent Events."""
+"""Header with the seconds that the client waits for the response."""
+EVENT_STREAM = "text/event-stream"
+"""Media type of Server-Sent Events."""
 
 
 class Format(StrEnum):
-    """How a message is written."""
+    """Media types of messages."""
 
     JSON = "application/json"
     PROTOBUF = "application/x-protobuf"
 
 
 def request_format(headers: Headers) -> Format:
-    """How the body is written; JSON when the request does not say.
+    """Return the format of the body; JSON if the headers do not name one.
 
     Raises:
-        UnsupportedMediaType: in no way that is understood.
+        UnsupportedMediaType: the content type or encoding is not supported.
     """
     encoding = headers.get("content-encoding", "identity").strip().lower()
     if encoding not in ("identity", ""):
         raise UnsupportedMediaType(
-            f'content-encoding "{encoding[:40]}" is not understood: send the body as it is'
+            f'content-encoding "{encoding[:40]}" is not supported: send the body uncompressed'
         )
     given = headers.get("content-type", "").partition(";")[0].strip().lower()
     if not given:
@@ -40,42 +38,42 @@ def request_format(headers: Headers) -> Format:
         return Format(given)
     except ValueError:
         known = " or ".join(Format)
-        raise UnsupportedMediaType(f'content-type "{given[:80]}" is not understood: send {known}') from None
+        raise UnsupportedMediaType(f'content-type "{given[:80]}" is not supported: send {known}') from None
 
 
-def answer_format(headers: Headers, preferred: Format) -> Format:
-    """How the client wants the answer.
+def response_format(headers: Headers, preferred: Format) -> Format:
+    """Return the format of the response.
 
     Args:
-        headers: of the request.
-        preferred: among those that the client likes equally well.
+        headers: headers of the request.
+        preferred: the format to choose among those that the client accepts equally.
 
     Raises:
-        NotAcceptable: in no way that is known here.
+        NotAcceptable: the client accepts none of the formats.
     """
     ranges = _media_ranges(headers)
     order = sorted(Format, key=lambda kind: kind is not preferred)
     best = max(order, key=lambda kind: _quality(kind.value, ranges))  # the first of equals
     if _quality(best.value, ranges) <= 0:
-        raise NotAcceptable(f"answers come as {' or '.join(Format)}")
+        raise NotAcceptable(f"responses are available as {' or '.join(Format)}")
     return best
 
 
 def check_events_accepted(headers: Headers) -> None:
-    """For answers that come as Server-Sent Events only.
+    """Refuse a client that does not accept Server-Sent Events.
 
     Raises:
-        NotAcceptable: the client does not want them.
+        NotAcceptable: the client does not accept them.
     """
-    if _quality(EVENTS, _media_ranges(headers)) <= 0:
-        raise NotAcceptable(f"answers come as {EVENTS}")
+    if _quality(EVENT_STREAM, _media_ranges(headers)) <= 0:
+        raise NotAcceptable(f"responses are available as {EVENT_STREAM}")
 
 
 def timeout(headers: Headers) -> float | None:
-    """s that the client gives, if it says so.
+    """Return the seconds that the client waits for the response; None if it does not say.
 
     Raises:
-        BadField: it says so in no number.
+        BadField: the header is not a positive number.
     """
     text = headers.get(TIMEOUT_HEADER)
     if text is None:
@@ -90,13 +88,13 @@ def timeout(headers: Headers) -> float | None:
 
 
 def _media_ranges(headers: Headers) -> list[tuple[str, float]]:
-    """Types and their qualities by an Accept header; without one anything will do."""
+    """Return the media ranges and qualities of the Accept header; without a header, "*/*"."""
     accept = headers.get("accept", "").strip() or "*/*"
     return [_media_range(part) for part in accept.split(",")]
 
 
 def _media_range(text: str) -> tuple[str, float]:
-    """Type and quality of one part of an Accept header; what cannot be read is not wanted."""
+    """Parse one media range of an Accept header. A quality that cannot be parsed counts as 0."""
     kind, *parameters = (part.strip().lower() for part in text.split(";"))
     quality = 1.0
     for parameter in parameters:
@@ -110,7 +108,7 @@ def _media_range(text: str) -> tuple[str, float]:
 
 
 def _quality(kind: str, ranges: list[tuple[str, float]]) -> float:
-    """By the most specific range that matches, as RFC 9110 has it."""
+    """Return the quality of a media type by the most specific range that matches (RFC 9110, 12.5.1)."""
     for pattern in (kind, f"{kind.partition('/')[0]}/*", "*/*"):
         found = [quality for given, quality in ranges if given == pattern]
         if found:

@@ -1,47 +1,90 @@
-"""The OpenAPI document: the contract as REST speaks it."""
+"""OpenAPI document: the contract as REST serves it."""
 
 from importlib import metadata
 from typing import Any
 
-from google.protobuf.descriptor import Descriptor
-
 from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
+from cab.forecast.v1 import model_service_pb2 as models_pb
+from cab.forecast.v1.bounds import STEP_SECONDS
+from cab.forecast.v1.routes import (
+    GET_AGENT_CONSISTENCY,
+    GET_MODEL,
+    GET_SCENE_CONSISTENCY,
+    LIST_MODEL_CONSISTENCY,
+    LIST_MODELS,
+    PREDICT,
+    RESET_SCENE,
+    ROUTES,
+    WATCH_SCENE,
+    Route,
+)
 from service.errors import (
     BadFields,
     DeadlineExceeded,
+    Internal,
     MethodNotAllowed,
+    NotAcceptable,
     NotFound,
     Overloaded,
+    ServiceError,
     TooLarge,
     TrackingUnavailable,
+    Unauthenticated,
     Unavailable,
     UnknownModel,
     UnknownTrack,
     UnsupportedMediaType,
 )
 from service.settings import Settings
-from service.transports.rest.examples import IDS, events_example, predict_examples, reset_examples
-from service.transports.rest.operations import (
-    body_of,
-    events_operation,
-    operation,
-    probe,
-    problem_schema,
-    timeout_parameter,
-)
-from service.transports.rest.schemas import Schema, message_schemas, query_parameters
+from service.transports.rest.codec import to_json
+from service.transports.rest.negotiation import EVENT_STREAM, TIMEOUT_HEADER, Format
+from service.transports.rest.problem import MEDIA_TYPE
+from service.transports.rest.schemas import Schema, comments, message_schemas, query_parameters, reference
 
 _DESCRIPTION = """Forecasts where road users will be in the next seconds, as Gaussian mixtures.
 
 The messages are those of the gRPC contract (`cab.forecast.v1`) as JSON by protobuf's JSON mapping, or as
 `application/x-protobuf`. Field names are read in snake_case and camelCase and written in snake_case.
-Errors are `application/problem+json` (RFC 9457); `reason` tells them apart."""
+Errors are `application/problem+json` (RFC 9457), with a machine-readable `reason`."""
+
+_Errors = tuple[type[ServiceError], ...]
+
+_ALL_METHODS: _Errors = (Unauthenticated, NotAcceptable, Unavailable, Internal)
+"""Errors that every method can return."""
+_ERRORS: dict[Route[Any, Any], _Errors] = {
+    PREDICT: (BadFields, UnknownModel, TooLarge, UnsupportedMediaType, Overloaded, DeadlineExceeded),
+    LIST_MODELS: (),
+    GET_MODEL: (UnknownModel, NotFound, MethodNotAllowed),
+    GET_AGENT_CONSISTENCY: (BadFields, UnknownTrack, TrackingUnavailable),
+    GET_SCENE_CONSISTENCY: (BadFields, UnknownTrack, TrackingUnavailable),
+    LIST_MODEL_CONSISTENCY: (BadFields,),
+    WATCH_SCENE: (BadFields, TrackingUnavailable, Overloaded),
+    RESET_SCENE: (BadFields, TooLarge, UnsupportedMediaType, TrackingUnavailable),
+}
+"""Further errors of each method."""
+_RETRYABLE = (Overloaded, Unavailable, TrackingUnavailable)
+_BINARY = {"schema": {"type": "string", "format": "binary"}}
+
+_NOW = 1_700_000_000.0
+_FRAMES = 9
+EXAMPLE_IDS = {"scene_id": "street-1", "agent_id": "car-1"}
+"""The scene that one of the examples names, and an agent of it."""
 
 
 def openapi_document(settings: Settings) -> dict[str, Any]:
-    """The document as a server with these settings serves it."""
-    secured = bool(settings.api_tokens)
-    schemas = message_schemas(settings) | {"Problem": problem_schema()}
+    """Return the document as a server with these settings serves it."""
+    paths: dict[str, Schema] = {
+        route.path: {route.verb.lower(): _operation(route, settings)} for route in ROUTES
+    }
+    if settings.api_tokens:
+        for operations in paths.values():
+            for operation in operations.values():
+                operation["security"] = [{"bearer": []}]
+    paths |= {
+        "/livez": {"get": _probe("livez", "Liveness: whether the process responds.")},
+        "/readyz": {"get": _probe("readyz", "Readiness: whether the server accepts calls.", Unavailable)},
+        "/metrics": {"get": _probe("metrics", "Metrics in the Prometheus text format.")},
+    }
     document: dict[str, Any] = {
         "openapi": "3.1.0",
         "info": {
@@ -50,90 +93,223 @@ def openapi_document(settings: Settings) -> dict[str, Any]:
             "description": _DESCRIPTION,
             "license": {"name": "Apache-2.0", "identifier": "Apache-2.0"},
         },
-        "paths": {
-            "/v1/predict": {"post": _predict()},
-            "/v1/models": {"get": operation("ModelService.ListModels", "ListModelsResponse")},
-            "/v1/models/{name}": {"get": _get_model()},
-            **_consistency(settings),
-            "/livez": {"get": probe("livez", "Whether the process answers at all.")},
-            "/readyz": {"get": probe("readyz", "Whether calls are taken.", Unavailable)},
-            "/metrics": {"get": probe("metrics", "Metrics in the Prometheus text format.")},
-        },
-        "components": {"schemas": schemas},
+        "paths": paths,
+        "components": {"schemas": message_schemas(settings) | {"Problem": _problem_schema()}},
     }
-    if secured:
+    if settings.api_tokens:
         document["components"]["securitySchemes"] = {"bearer": {"type": "http", "scheme": "bearer"}}
-        for path, operations in document["paths"].items():
-            if path.startswith("/v1/"):
-                for each in operations.values():
-                    each["security"] = [{"bearer": []}]
     return document
 
 
-def _predict() -> Schema:
-    waits = "s that the client waits for the answer; what has not begun by then never does."
-    return operation(
-        "PredictionService.Predict",
-        "PredictResponse",
-        (BadFields, UnknownModel, TooLarge, UnsupportedMediaType, Overloaded, DeadlineExceeded),
-        [timeout_parameter(waits)],
-        body_of("PredictRequest", predict_examples()),
+def _operation(route: Route[Any, Any], settings: Settings) -> Schema:
+    """Return the operation of a method; its description is the comment of the contract."""
+    text = comments()[f"{route.service.rpartition('.')[2]}.{route.method}"]
+    response = route.response.DESCRIPTOR.name
+    content = (
+        _event_content(response)
+        if route.streaming
+        else {Format.JSON.value: {"schema": reference(response)}, Format.PROTOBUF.value: _BINARY}
     )
-
-
-def _get_model() -> Schema:
-    name = {
-        "name": "name",
-        "in": "path",
-        "required": True,
-        "description": '"name", which means its newest version, or "name@version".',
-        "schema": {"type": "string", "minLength": 1},
-        "example": "kalman",
+    operation: Schema = {
+        "operationId": route.method,
+        "summary": text.split(". ")[0].rstrip("."),
+        "description": text,
+        "responses": {
+            "200": {"description": "The response.", "content": content},
+            **_problems((*_ALL_METHODS, *_ERRORS[route])),
+        },
     }
-    errors = (UnknownModel, NotFound, MethodNotAllowed)
-    return operation("ModelService.GetModel", "GetModelResponse", errors, [name])
+    parameters = _parameters(route, settings)
+    if parameters:
+        operation["parameters"] = parameters
+    if route.verb == "POST":
+        examples = predict_examples() if route is PREDICT else reset_examples()
+        json = {"schema": reference(route.request.DESCRIPTOR.name), "examples": examples}
+        body = {Format.JSON.value: json, Format.PROTOBUF.value: _BINARY}
+        operation["requestBody"] = {"required": True, "content": body}
+    return operation
 
 
-def _consistency(settings: Settings) -> dict[str, Schema]:
-    def query(descriptor: Descriptor) -> list[Schema]:
-        return query_parameters(descriptor, settings, IDS | {"window": 2.0})
+def _parameters(route: Route[Any, Any], settings: Settings) -> list[Schema]:
+    """Return the parameters of a method in path, query and headers."""
+    if route is PREDICT:
+        return [
+            _timeout_parameter(
+                "Seconds that the client waits for the response; work not begun by then is dropped."
+            )
+        ]
+    if route is GET_MODEL:
+        return [
+            {
+                "name": "name",
+                "in": "path",
+                "required": True,
+                "description": '"name", for the newest version, or "name@version".',
+                "schema": {"type": "string", "minLength": 1},
+                "example": "kalman",
+            }
+        ]
+    if route.verb == "POST":
+        return []
+    parameters = query_parameters(route.request.DESCRIPTOR, settings, EXAMPLE_IDS | {"window": 2.0})
+    if route is WATCH_SCENE:
+        parameters.append(
+            _timeout_parameter("Seconds after which the stream ends; without this header it goes on.")
+        )
+    return parameters
 
-    asked = (BadFields, UnknownTrack, TrackingUnavailable)
-    agent = operation(
-        "ConsistencyService.GetAgentConsistency",
-        "GetAgentConsistencyResponse",
-        asked,
-        query(consistency_pb.GetAgentConsistencyRequest.DESCRIPTOR),
-    )
-    scene = operation(
-        "ConsistencyService.GetSceneConsistency",
-        "GetSceneConsistencyResponse",
-        asked,
-        query(consistency_pb.GetSceneConsistencyRequest.DESCRIPTOR),
-    )
-    models = operation(
-        "ConsistencyService.ListModelConsistency", "ListModelConsistencyResponse", (BadFields,)
-    )
-    events = events_operation(
-        "ConsistencyService.WatchScene",
-        "WatchSceneResponse",
-        (BadFields, TrackingUnavailable, Overloaded),
-        [
-            *query(consistency_pb.WatchSceneRequest.DESCRIPTOR),
-            timeout_parameter("s after which the events end; without it they go on."),
+
+def _event_content(message: str) -> Schema:
+    """Return the content of a response of Server-Sent Events.
+
+    Args:
+        message: name of the message in each event.
+    """
+    data = {
+        "type": "string",
+        "contentMediaType": Format.JSON.value,
+        "contentSchema": {"oneOf": [reference(message), reference("Problem")]},
+    }
+    # OpenAPI 3.1 cannot describe streams; tools take the schema for that of each event.
+    schema = {
+        "type": "object",
+        "description": f"One Server-Sent Event: a {message}, or, in a last event of type `error`, a Problem. "
+        "While there are no events, comments are sent as heartbeats.",
+        "properties": {"event": {"type": "string", "enum": ["message", "error"]}, "data": data},
+        "required": ["data"],
+    }
+    return {EVENT_STREAM: {"schema": schema, "example": _event_example()}}
+
+
+def _timeout_parameter(description: str) -> Schema:
+    return {
+        "name": TIMEOUT_HEADER,
+        "in": "header",
+        "required": False,
+        "description": description,
+        "schema": {"type": "number", "exclusiveMinimum": 0},
+    }
+
+
+def _probe(name: str, description: str, *errors: type[ServiceError]) -> Schema:
+    """Return an operation outside the contract, with a response in plain text."""
+    content = {"text/plain": {"schema": {"type": "string"}}}
+    return {
+        "operationId": name,
+        "summary": description.rstrip("."),
+        "responses": {"200": {"description": "Success.", "content": content}, **_problems(errors)},
+    }
+
+
+def _problem_schema() -> Schema:
+    """Return the schema of a problem document."""
+    text = {"type": "string"}
+    fault = {
+        "type": "object",
+        "properties": {
+            "field": {"type": "string", "description": 'Path in the request, e.g. "agents[3].states[1].x".'},
+            "detail": text,
+        },
+        "required": ["field", "detail"],
+    }
+    return {
+        "type": "object",
+        "description": "An error (RFC 9457).",
+        "properties": {
+            "type": {"type": "string", "format": "uri"},
+            "title": text,
+            "status": {"type": "integer"},
+            "detail": text,
+            "code": {"type": "string", "description": "Name of the gRPC status code."},
+            "reason": {
+                "type": "string",
+                "description": "Machine-readable cause; tells errors with the same code apart.",
+            },
+            "errors": {"type": "array", "items": fault, "description": "The fields that are wrong."},
+        },
+        "required": ["type", "title", "status", "detail", "code", "reason", "errors"],
+    }
+
+
+def _problems(errors: _Errors) -> dict[str, Schema]:
+    """Return responses by HTTP status; errors with the same status share one."""
+    responses: dict[str, Schema] = {}
+    for error in sorted(errors, key=lambda row: row.http_status):
+        text = f"{error.title} (`{error.reason}`)."
+        response = responses.setdefault(
+            str(error.http_status),
+            {"description": "", "content": {MEDIA_TYPE: {"schema": reference("Problem")}}},
+        )
+        response["description"] = f"{response['description']} {text}".strip()
+        if error in _RETRYABLE:
+            response["headers"] = {
+                "Retry-After": {
+                    "description": "Seconds to wait before a retry.",
+                    "schema": {"type": "integer"},
+                }
+            }
+    return responses
+
+
+def predict_examples() -> dict[str, dict[str, Any]]:
+    """Return example requests of Predict by name; each works as it stands."""
+    car = _agent(EXAMPLE_IDS["agent_id"], "AGENT_TYPE_VEHICLE", x=100.0, y=50.0, speed=8.0)
+    walker = _agent("walker-1", "AGENT_TYPE_PEDESTRIAN", x=110.0, y=56.0, speed=1.4)
+    parked = _agent("car-2", "AGENT_TYPE_VEHICLE", x=130.0, y=47.0, speed=0.0) | {"predict": False}
+    return {
+        "one_car": {
+            "summary": "One car, with the server's default model",
+            "value": {"time": _NOW, "agents": [car]},
+        },
+        "street": {
+            "summary": "A car and a pedestrian beside a parked car; at most three merged modes, 3 s ahead",
+            "value": {
+                "scene_id": EXAMPLE_IDS["scene_id"],
+                "time": _NOW,
+                "agents": [car, walker, parked],
+                "options": {"merge": True, "max_modes": 3, "horizon": 3.0},
+            },
+        },
+        "samples": {
+            "summary": "Ten sampled trajectories from a named model",
+            "value": {
+                "time": _NOW,
+                "model": "kalman",
+                "agents": [car],
+                "options": {"max_modes": 1, "samples": 10, "seed": 7},
+            },
+        },
+    }
+
+
+def reset_examples() -> dict[str, dict[str, Any]]:
+    """Return example requests of ResetScene by name."""
+    return {"street": {"summary": "Forget a scene", "value": {"scene_id": EXAMPLE_IDS["scene_id"]}}}
+
+
+def _event_example() -> dict[str, str]:
+    """Return an example event of WatchScene."""
+    instant = consistency_pb.InstantConsistency(
+        agent_id=EXAMPLE_IDS["agent_id"],
+        time=_NOW,
+        model=models_pb.ModelReference(
+            name="kalman", version="1.0.0", protocol=models_pb.INPUT_PROTOCOL_CAUSAL
+        ),
+        errors=[
+            consistency_pb.AgeError(age=0.5, displacement_error=0.12, most_likely_was_nearest=True),
+            consistency_pb.AgeError(age=1.0, displacement_error=0.31, most_likely_was_nearest=True),
         ],
-        events_example(),
-    )
-    reset = operation(
-        "ConsistencyService.ResetScene",
-        "ResetSceneResponse",
-        (BadFields, TooLarge, UnsupportedMediaType, TrackingUnavailable),
-        body=body_of("ResetSceneRequest", reset_examples()),
     )
     return {
-        "/v1/consistency/agent": {"get": agent},
-        "/v1/consistency/scene": {"get": scene},
-        "/v1/consistency/models": {"get": models},
-        "/v1/consistency/events": {"get": events},
-        "/v1/consistency/reset": {"post": reset},
+        "event": "message",
+        "data": to_json(consistency_pb.WatchSceneResponse(instants=[instant])).decode(),
     }
+
+
+def _agent(agent_id: str, kind: str, x: float, y: float, speed: float) -> dict[str, Any]:
+    """Return an agent that moves along x and is now at (x, y)."""
+    states = []
+    for age in range(_FRAMES - 1, -1, -1):
+        seconds = age * STEP_SECONDS
+        states.append({"time": _NOW - seconds, "x": round(x - speed * seconds, 3), "y": y, "heading": 0.0})
+    return {"id": agent_id, "type": kind, "states": states}

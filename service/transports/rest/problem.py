@@ -1,4 +1,4 @@
-"""Errors as problem+json (RFC 9457)."""
+"""Errors as problem+json (RFC 9457); the counterpart of gRPC's status details."""
 
 import math
 from typing import Any
@@ -12,7 +12,7 @@ MEDIA_TYPE = "application/problem+json"
 
 
 def to_problem(error: ServiceError) -> dict[str, Any]:
-    """The problem document of an error."""
+    """Return the problem document of an error."""
     return {
         "type": error.type_uri(),
         "title": error.title,
@@ -25,11 +25,11 @@ def to_problem(error: ServiceError) -> dict[str, Any]:
 
 
 def problem_response(error: ServiceError, headers: dict[str, str] | None = None) -> Response:
-    """The answer that an error becomes.
+    """Return the HTTP response for an error.
 
     Args:
-        error: what went wrong.
-        headers: more headers.
+        error: the error.
+        headers: additional headers.
     """
     headers = dict(headers or {})
     if error.retry_after is not None:

@@ -1,17 +1,17 @@
-"""JSON schemas of the contract's messages, from their descriptors and comments."""
+"""JSON schemas of the contract's messages, from their descriptors and the comments of the .proto files."""
 
+import functools
+import re
 from collections.abc import Iterable
+from importlib import resources
 from typing import Any
 
 from google.protobuf.descriptor import Descriptor, EnumDescriptor, FieldDescriptor
 
-from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
-from cab.forecast.v1 import model_service_pb2 as models_pb
-from cab.forecast.v1 import prediction_service_pb2 as pb
 from cab.forecast.v1.bounds import FIELD_BOUNDS, MAX_ID_LENGTH, STEP_SECONDS
+from cab.forecast.v1.routes import ROUTES
 from service.settings import Settings
 from service.tracking.store.base import WINDOW
-from service.transports.rest.comments import comments
 
 Schema = dict[str, Any]
 
@@ -22,22 +22,9 @@ _SCALARS: dict[int, Schema] = {
     FieldDescriptor.TYPE_STRING: {"type": "string"},
     FieldDescriptor.TYPE_BOOL: {"type": "boolean"},
     FieldDescriptor.TYPE_UINT32: {"type": "integer", "minimum": 0, "maximum": _UINT32_MAX},
-    # As a string, by protobuf's JSON mapping: JSON's numbers are doubles to many who read them
+    # A string, by protobuf's JSON mapping: many JSON parsers read numbers as doubles.
     FieldDescriptor.TYPE_UINT64: {"type": "string", "format": "uint64", "pattern": "^[0-9]+$"},
 }
-_REQUESTS = (pb.PredictRequest, consistency_pb.ResetSceneRequest)
-_ANSWERS = (
-    pb.PredictResponse,
-    models_pb.ListModelsResponse,
-    models_pb.GetModelResponse,
-    consistency_pb.GetAgentConsistencyResponse,
-    consistency_pb.GetSceneConsistencyResponse,
-    consistency_pb.ListModelConsistencyResponse,
-    consistency_pb.ResetSceneResponse,
-    consistency_pb.WatchSceneResponse,
-)
-
-# What the comments of the contract say in words; a descriptor cannot.
 REQUIRED = {
     "PredictRequest": ["time"],
     "Agent": ["id", "type", "states"],
@@ -49,10 +36,66 @@ REQUIRED = {
     "ResetSceneRequest": ["scene_id"],
     "WatchSceneRequest": ["scene_id"],
 }
+"""Required fields by message. Descriptors cannot tell; the comments of the contract say it in words."""
+
+_BLOCK = re.compile(r"(message|enum|service|oneof)\s+(\w+)\s*\{(\s*\})?")
+_RPC = re.compile(r"rpc\s+(\w+)\s*\(")
+_FIELD = re.compile(r"(?:optional\s+|repeated\s+)?(?:map<[^>]*>|[\w.]+)\s+(\w+)\s*=\s*\d+")
+_VALUE = re.compile(r"([A-Z][A-Z0-9_]*)\s*=\s*\d+\s*;")
+
+
+@functools.cache
+def comments(package: str = "cab.forecast.v1") -> dict[str, str]:
+    """Return the comments of the .proto files, which generated code does not carry.
+
+    Args:
+        package: Python package that contains the .proto files.
+
+    Returns:
+        The comment above each message, field, enum, value and method, in one line, by name within the
+        package, e.g. "PredictRequest.time" or "PredictionService.Predict". A field of a oneof counts as a
+        field of the message.
+    """
+    found: dict[str, str] = {}
+    for file in resources.files(package).iterdir():
+        if file.name.endswith(".proto"):
+            found |= parse_comments(file.read_text(encoding="utf-8"))
+    return found
+
+
+def parse_comments(source: str) -> dict[str, str]:
+    """Parse the comments of one .proto file, in the format of `buf format`: one declaration per line.
+
+    Returns:
+        The comments by name, as ``comments``.
+    """
+    found: dict[str, str] = {}
+    scope: list[str | None] = []  # None: the members belong to the enclosing block
+    lines: list[str] = []
+    for line in map(str.strip, source.splitlines()):
+        if line.startswith("//"):
+            lines.append(line.removeprefix("//").strip())
+            continue
+        text, lines = " ".join(lines), []
+        block = _BLOCK.match(line)
+        declared = _RPC.match(line) or (scope and (_VALUE.match(line) or _FIELD.match(line))) or None
+        if block and block[1] != "oneof":
+            name = block[2]
+        elif declared:
+            name = declared[1]
+        else:
+            name = ""
+        if name and text:
+            found[".".join([part for part in scope if part] + [name])] = text
+        if block and not block[3]:
+            scope.append(None if block[1] == "oneof" else block[2])
+        elif line == "}" and scope:
+            scope.pop()
+    return found
 
 
 def bounds(settings: Settings) -> dict[str, Schema]:
-    """Limits of the request's fields by "Message.field"."""
+    """Return the limits of request fields, as JSON schema keywords, by "Message.field"."""
     an_id = {"minLength": 1, "maxLength": MAX_ID_LENGTH}
     numbers = {name: {"minimum": low, "maximum": high} for name, (low, high) in FIELD_BOUNDS.items()}
     return numbers | {
@@ -74,10 +117,12 @@ def bounds(settings: Settings) -> dict[str, Schema]:
 
 
 def message_schemas(settings: Settings) -> dict[str, Schema]:
-    """Schemas of all messages and enums that REST carries, by name."""
+    """Return the schemas of all messages and enums that REST carries, by name."""
     limits = bounds(settings)
     schemas: dict[str, Schema] = {}
-    for roots, are_requests in ((_REQUESTS, True), (_ANSWERS, False)):
+    requests = [route.request for route in ROUTES if route.verb == "POST"]  # GET has no body
+    responses = [route.response for route in ROUTES]
+    for roots, are_requests in ((requests, True), (responses, False)):
         for descriptor in _reachable(root.DESCRIPTOR for root in roots):
             schemas[descriptor.name] = _message(descriptor, are_requests, limits)
             for field in descriptor.fields:
@@ -87,12 +132,12 @@ def message_schemas(settings: Settings) -> dict[str, Schema]:
 
 
 def query_parameters(descriptor: Descriptor, settings: Settings, examples: Schema) -> list[Schema]:
-    """A message's fields, which are scalars, as parameters of GET.
+    """Return the query parameters of a GET: the fields of its request, which are scalars.
 
     Args:
-        descriptor: of the message.
+        descriptor: descriptor of the request.
         settings: the limits.
-        examples: a value for each field.
+        examples: an example value for each field.
     """
     limits = bounds(settings)
     parameters = []
@@ -111,12 +156,12 @@ def query_parameters(descriptor: Descriptor, settings: Settings, examples: Schem
 
 
 def reference(name: str) -> Schema:
-    """Points at a schema."""
+    """Return a reference to a schema."""
     return {"$ref": f"#/components/schemas/{name}"}
 
 
 def _reachable(descriptors: Iterable[Descriptor]) -> list[Descriptor]:
-    """Messages and all within them; maps are no messages of their own here."""
+    """Return messages and all that their fields contain, except the entries of maps."""
     found: list[Descriptor] = []
     pending = list(descriptors)
     while pending:

@@ -176,7 +176,7 @@ async def test_events(server: Server, plane: FakePlane, client: httpx.AsyncClien
 async def test_heartbeats(
     plane: FakePlane, client: httpx.AsyncClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.transports.rest.events.HEARTBEAT", 0.1)
+    monkeypatch.setattr("service.transports.rest.endpoints.HEARTBEAT", 0.1)
     async with client.stream("GET", EVENTS) as response:
         reader = Reader(response)
         assert [await reader.read() for _ in range(3)] == [BEGUN, ": heartbeat", ": heartbeat"]

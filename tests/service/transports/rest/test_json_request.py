@@ -15,8 +15,7 @@ from cab.forecast.v1 import prediction_service_pb2 as pb
 from service.errors import BadField, TooLarge
 from service.predict.request_reader import RequestLimits
 from service.settings import Settings
-from service.transports.rest.codec import parse_json
-from service.transports.rest.json_request import read_request
+from service.transports.rest.codec import parse_json, read_request
 from tests.service.requests import add_agent, make_request
 from tests.service.timing import cpu_seconds
 
@@ -53,8 +52,8 @@ def test_as_many_as_may_be() -> None:
         ([{"states": [{}] * 6}], "more than 5 states"),
         ([{"states": [{}] * 3}] * 2, "more than 5 states"),
         ([{"states": [None] * 6}], "more than 5 states"),
-        ([{"states": [{}] * 2000}], "more objects than"),
-        ([{"id": [[]] * 2000}], "more objects than"),
+        ([{"states": [{}] * 2000}], "more objects and lists than"),
+        ([{"id": [[]] * 2000}], "more objects and lists than"),
         ([{"states": [{"x": [0] * 3000}]}], "more values than"),
     ],
 )

@@ -6,9 +6,9 @@ from starlette.datastructures import Headers
 from service.errors import BadField, NotAcceptable, UnsupportedMediaType
 from service.transports.rest.negotiation import (
     Format,
-    answer_format,
     check_events_accepted,
     request_format,
+    response_format,
     timeout,
 )
 
@@ -57,7 +57,7 @@ def test_content_type_refused(headers: dict[str, str]) -> None:
     ],
 )
 def test_accept(accept: str | None, expected: Format) -> None:
-    assert answer_format(Headers({"accept": accept} if accept else {}), preferred=PROTOBUF) is expected
+    assert response_format(Headers({"accept": accept} if accept else {}), preferred=PROTOBUF) is expected
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_accept(accept: str | None, expected: Format) -> None:
 )
 def test_accept_refused(accept: str) -> None:
     with pytest.raises(NotAcceptable):
-        answer_format(Headers({"accept": accept}), preferred=JSON)
+        response_format(Headers({"accept": accept}), preferred=JSON)
 
 
 @pytest.mark.parametrize("accept", [None, "*/*", "text/*", "text/event-stream", "text/html, */*;q=0.1"])

@@ -13,10 +13,8 @@ from cab.forecast.v1 import prediction_service_pb2 as pb
 from service.settings import Settings
 from service.tracking.store.base import WINDOW
 from service.transports.rest.codec import to_dict
-from service.transports.rest.comments import comments, parse_comments
-from service.transports.rest.examples import IDS, predict_examples, reset_examples
-from service.transports.rest.openapi import openapi_document
-from service.transports.rest.schemas import REQUIRED, bounds
+from service.transports.rest.openapi import EXAMPLE_IDS, openapi_document, predict_examples, reset_examples
+from service.transports.rest.schemas import REQUIRED, bounds, comments, parse_comments
 from tests.service.fakes import FakeForecaster
 from tests.service.servers import running
 
@@ -161,7 +159,9 @@ async def test_examples_work(default: str) -> None:
             forecasts = response.json()["forecasts"]
             assert forecasts
             assert all(forecast["status"] == "FORECAST_STATUS_OK" for forecast in forecasts)
-        found = await client.get(f"{base}/v1/consistency/agent", params=IDS)  # one of them names a scene
+        found = await client.get(
+            f"{base}/v1/consistency/agent", params=EXAMPLE_IDS
+        )  # one of them names a scene
         assert found.status_code == 200, found.text
         for example in reset_examples().values():
             response = await client.post(f"{base}/v1/consistency/reset", json=example["value"])

@@ -1,4 +1,4 @@
-"""Streams of events as transports need them: closed whatever happens, and with word of when nothing comes."""
+"""Helpers for streamed responses: iterators that are always closed, and idle detection."""
 
 import asyncio
 from collections.abc import AsyncGenerator, AsyncIterator
@@ -10,7 +10,7 @@ _T = TypeVar("_T")
 
 @asynccontextmanager
 async def closing(events: AsyncIterator[_T]) -> AsyncIterator[AsyncIterator[_T]]:
-    """Closes an iterator, if it is one that can be, when this is left."""
+    """Close an iterator on exit, if it has ``aclose``."""
     try:
         yield events
     finally:
@@ -19,12 +19,12 @@ async def closing(events: AsyncIterator[_T]) -> AsyncIterator[AsyncIterator[_T]]
             await close()
 
 
-async def paced(events: AsyncIterator[_T], pause: float) -> AsyncGenerator[_T | None]:
-    """Events as they come, and None whenever none came for a while.
+async def with_idle_ticks(events: AsyncIterator[_T], interval: float) -> AsyncGenerator[_T | None]:
+    """Yield events as they arrive, and None whenever none arrived for one interval.
 
     Args:
-        events: is closed when this ends or is closed, also while it is being waited for.
-        pause: s to wait for an event.
+        events: closed when this generator ends or is closed, even while an event is awaited.
+        interval: seconds.
 
     Raises:
         Exception: whatever ``events`` raises.
@@ -35,7 +35,7 @@ async def paced(events: AsyncIterator[_T], pause: float) -> AsyncGenerator[_T | 
             while True:
                 if pending is None:
                     pending = asyncio.ensure_future(anext(events))
-                done, _ = await asyncio.wait({pending}, timeout=pause)
+                done, _ = await asyncio.wait({pending}, timeout=interval)
                 if not done:
                     yield None
                     continue
@@ -46,6 +46,6 @@ async def paced(events: AsyncIterator[_T], pause: float) -> AsyncGenerator[_T | 
                 pending = None
                 yield event
         finally:
-            if pending is not None:  # or the iterator, still running, would refuse to be closed
+            if pending is not None:  # a generator that is still running cannot be closed
                 pending.cancel()
                 await asyncio.gather(pending, return_exceptions=True)

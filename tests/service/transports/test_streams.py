@@ -6,7 +6,7 @@ from contextlib import aclosing
 
 import pytest
 
-from service.transports.watching import paced
+from service.transports.streams import with_idle_ticks
 
 
 class Source:
@@ -29,7 +29,7 @@ class Source:
 
 async def test_tells_of_silence_and_loses_nothing() -> None:
     source = Source()
-    async with aclosing(paced(source.events(), 0.03)) as found:
+    async with aclosing(with_idle_ticks(source.events(), 0.03)) as found:
         assert [await anext(found) for _ in range(3)] == [None] * 3
         for event in range(3):
             source.queue.put_nowait(event)
@@ -44,7 +44,7 @@ async def test_raises_what_the_source_raises() -> None:
     source = Source()
     source.queue.put_nowait(KeyError("x"))
     with pytest.raises(KeyError):
-        [_ async for _ in paced(source.events(), 1)]
+        [_ async for _ in with_idle_ticks(source.events(), 1)]
     assert source.closed
 
 
@@ -52,7 +52,7 @@ async def test_closes_the_source_while_it_is_being_waited_for() -> None:
     source = Source()
 
     async def read() -> None:
-        async with aclosing(paced(source.events(), 0.01)) as found:
+        async with aclosing(with_idle_ticks(source.events(), 0.01)) as found:
             async for _ in found:
                 pass
 
@@ -63,6 +63,6 @@ async def test_closes_the_source_while_it_is_being_waited_for() -> None:
         await reading
     assert source.closed
     second = Source()
-    async with aclosing(paced(second.events(), 0.01)) as found:
+    async with aclosing(with_idle_ticks(second.events(), 0.01)) as found:
         assert await anext(found) is None
     assert second.closed
