@@ -36,10 +36,10 @@ from service.telemetry.metrics import Metrics
 from service.tracking.collector import ConsistencyCollector, StoreMetrics
 from service.tracking.model_references import ModelReferences
 from service.tracking.service import ConsistencyService
-from service.tracking.store.base import Sighting
+from service.tracking.store.base import TrackUpdate
 from service.tracking.store.factory import make_store
 from service.tracking.store.guard import Guard
-from service.tracking.tracker import Tracked, Tracker
+from service.tracking.tracker import Tracker, TrackingResult
 
 _log = structlog.get_logger(__name__)
 
@@ -105,7 +105,7 @@ class DataPlane:
         self._tracker = Tracker(
             self._store, self._guard, self._asking, settings.store_budget_ms / 1000, self._references
         )
-        metrics.registry.register(ConsistencyCollector(self._tracker.sums))
+        metrics.registry.register(ConsistencyCollector(self._tracker.aggregates))
         self.consistency = ConsistencyService(
             self._store, self._asking, self._tracker, self._references, self._lifecycle
         )
@@ -224,7 +224,7 @@ class DataPlane:
         catalog = call.catalog
         forecaster = catalog.get(request.model)
         options = read_options(request, forecaster.info, self._settings)
-        before: Tracked | None = None
+        before: TrackingResult | None = None
         agents: Agents | None = None
         with self._batcher.admit(options.predicted, accepted) as admission:
             if options.recalls:
@@ -259,7 +259,7 @@ class DataPlane:
 
     async def _recall(
         self, request: pb.PredictRequest, options: Options, forecaster: Forecaster, call: Call
-    ) -> tuple[Agents, Tracked]:
+    ) -> tuple[Agents, TrackingResult]:
         """The agents, with what the memory knows of them."""
         agents = await self._in_thread(read_agents, request, self._settings)
         own = observed(agents, (forecaster, call.catalog.fallback))
@@ -268,12 +268,12 @@ class DataPlane:
             options.time,
             own,
             call.left() - _RESERVE,
-            recall=history_seconds(frames_of(forecaster, call.catalog)),
+            history_s=history_seconds(frames_of(forecaster, call.catalog)),
             latest=options.consistency,
         )
         return with_histories(agents, own, tracked.histories), tracked
 
-    async def _remember(self, options: Options, brought: Sequence[Sighting], call: Call) -> Tracked:
+    async def _remember(self, options: Options, brought: Sequence[TrackUpdate], call: Call) -> TrackingResult:
         latest = options.consistency and not options.recalls
         return await self._tracker.exchange(
             options.scene_id, options.time, brought, call.left() - _RESERVE, latest=latest

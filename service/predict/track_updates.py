@@ -10,9 +10,9 @@ from model.forecaster import Context, Forecaster
 from service.predict.encode import Result
 from service.predict.plan import Plan
 from service.predict.request import Agents
-from service.tracking.store.base import Sighting
-from service.tracking.store.records import KINDS, pack_forecasts, pack_observations, unpack_observations
-from service.tracking.tracker import Tracked
+from service.tracking.store.base import TrackUpdate
+from service.tracking.store.records import AGENT_TYPES, pack_forecasts, pack_observations, unpack_observations
+from service.tracking.tracker import TrackingResult
 
 Status: TypeAlias = "consistency_pb.TrackingStatus.ValueType"
 _SEVERITY = (
@@ -24,7 +24,7 @@ _SEVERITY = (
 )
 
 
-def observed(agents: Agents, models: tuple[Forecaster, Forecaster]) -> list[Sighting]:
+def observed(agents: Agents, models: tuple[Forecaster, Forecaster]) -> list[TrackUpdate]:
     """All that a call says of its agents, before they are forecast.
 
     Args:
@@ -36,9 +36,9 @@ def observed(agents: Agents, models: tuple[Forecaster, Forecaster]) -> list[Sigh
         return []
     packed = pack_observations(agents.observations, newest_only=False)
     return [
-        Sighting(
+        TrackUpdate(
             agents.ids[index],
-            KINDS[kind],
+            AGENT_TYPES[kind],
             observations,
             (forecaster if kind in forecaster.info.agent_types else fallback).info.full_name,
         )
@@ -46,7 +46,7 @@ def observed(agents: Agents, models: tuple[Forecaster, Forecaster]) -> list[Sigh
     ]
 
 
-def with_histories(agents: Agents, own: Sequence[Sighting], histories: Mapping[str, bytes]) -> Agents:
+def with_histories(agents: Agents, own: Sequence[TrackUpdate], histories: Mapping[str, bytes]) -> Agents:
     """Agents with what the memory recalls of them.
 
     Args:
@@ -60,7 +60,7 @@ def with_histories(agents: Agents, own: Sequence[Sighting], histories: Mapping[s
     return replace(agents, observations=unpack_observations(packed))
 
 
-def sightings(plan: Plan, results: Sequence[Result], remembered: bool) -> list[Sighting]:
+def sightings(plan: Plan, results: Sequence[Result], remembered: bool) -> list[TrackUpdate]:
     """What a call brings: forecasts but for blind ones, and each agent's newest observation, unless it is
     remembered already.
 
@@ -86,11 +86,13 @@ def sightings(plan: Plan, results: Sequence[Result], remembered: bool) -> list[S
             continue
         observations = b"" if remembered else newest
         steps = plan.options.steps if forecast else 0
-        brought.append(Sighting(agents.ids[index], KINDS[kind], observations, series, forecast, steps))
+        brought.append(
+            TrackUpdate(agents.ids[index], AGENT_TYPES[kind], observations, series, forecast, steps)
+        )
     return brought
 
 
-def report(response: pb.PredictResponse, before: Tracked | None, after: Tracked) -> None:
+def report(response: pb.PredictResponse, before: TrackingResult | None, after: TrackingResult) -> None:
     """Puts what the memory said into the answer.
 
     Args:

@@ -1,1 +1,1 @@
-"""Track memory: what it tells of forecasts, and the stores it is kept in."""
+"""Track memory, and the consistency of forecasts computed from it."""

@@ -1,4 +1,4 @@
-"""Settled sets, summed by model."""
+"""Consistency metrics of settled sets, aggregated by model."""
 
 from collections.abc import Sequence
 
@@ -6,73 +6,82 @@ import numpy as np
 
 from model.arrays import Floats, Ints
 from model.metrics.convergence import RANGES_M
-from service.tracking.metrics import Figures
-from service.tracking.quantile_sketch import Sketches, Spread
+from service.tracking.metrics import InstantMetrics
+from service.tracking.quantile_sketch import Distribution, QuantileSketches
 from service.tracking.store.records import AGES
 
 DISPERSIONS = range(3)
-"""Numbers of the figures that are dispersion, in the order of ``model.metrics.dispersion.Dispersion``, m."""
+"""Indices of the dispersion metrics, in the order of ``model.metrics.dispersion.Dispersion``, m."""
 CONVERGENCES = range(DISPERSIONS.stop, DISPERSIONS.stop + len(RANGES_M))
-"""C(τ) for each of ``RANGES_M``, s."""
+"""Indices of C(τ), one per range of ``RANGES_M``, s."""
 ERRORS = range(CONVERGENCES.stop, CONVERGENCES.stop + AGES)
-"""Displacement error by age, m."""
+"""Indices of the displacement errors by age, m."""
 
 
-class ModelSums:
-    """Of one model: the figures numbered above."""
+class ModelAggregate:
+    """Distributions of the metrics of one model, by the indices above."""
 
     def __init__(self) -> None:
-        self._sketches = Sketches(ERRORS.stop)
+        self._sketches = QuantileSketches(ERRORS.stop)
         self._nearest: Ints = np.zeros(AGES, dtype=np.int64)
         self.instants = 0
-        """Sets that were counted."""
+        """Number of aggregated sets."""
 
-    def add(self, figures: Figures, rows: Ints) -> None:
-        """Counts sets.
+    def add(self, metrics: InstantMetrics, rows: Ints) -> None:
+        """Add sets.
 
         Args:
-            figures: among others of these.
-            rows: [n], which; all complete.
+            metrics: metrics of P instants.
+            rows: [n], the instants to add; all complete.
         """
-        apart = np.stack(figures.dispersion[: len(DISPERSIONS)], axis=1)
-        values = np.concatenate([apart, figures.convergence_s, figures.errors_m], axis=1)[rows]
+        dispersion = np.stack(metrics.dispersion[: len(DISPERSIONS)], axis=1)
+        values = np.concatenate([dispersion, metrics.convergence_s, metrics.errors_m], axis=1)[rows]
         self._sketches.add(values)
-        self._nearest += figures.nearest[rows].sum(axis=0)
+        self._nearest += metrics.nearest[rows].sum(axis=0)
         self.instants += len(rows)
 
-    def spread(self, figure: int, quantiles: tuple[float, ...]) -> Spread:
-        """The distribution of one of the figures."""
-        return self._sketches.spread(figure, quantiles)
+    def summarize(self, metric: int, quantiles: tuple[float, ...]) -> Distribution:
+        """Return the summary of one metric."""
+        return self._sketches.summarize(metric, quantiles)
 
-    def up_to(self, figure: int, bounds: Floats) -> Ints:
-        """[B], how many sets have at most each bound [B] of a figure."""
-        return self._sketches.up_to(figure, bounds)
+    def count_up_to(self, metric: int, bounds: Floats) -> Ints:
+        """Return how many sets have at most each value of a metric, [B].
 
-    def sum(self, figure: int) -> float:
-        """Of one of the figures, over all sets."""
-        return self._sketches.sum(figure)
+        Args:
+            metric: index of the metric.
+            bounds: [B].
+        """
+        return self._sketches.count_up_to(metric, bounds)
 
-    def nearest(self, age: int) -> float:
-        """In what share of the sets the most likely mode was the nearest one, by age counted from 0."""
+    def sum(self, metric: int) -> float:
+        """Return the sum of one metric over all sets."""
+        return self._sketches.sum(metric)
+
+    def nearest_share(self, age: int) -> float:
+        """Return the share of sets in which the most likely mode was the nearest one.
+
+        Args:
+            age: index of the age, from 0.
+        """
         return float(self._nearest[age]) / self.instants if self.instants else 0.0
 
 
-class Sums:
-    """Sums by model, name@version."""
+class Aggregates:
+    """Aggregates by model, ``name@version``."""
 
     def __init__(self) -> None:
-        self.models: dict[str, ModelSums] = {}
+        self.models: dict[str, ModelAggregate] = {}
 
-    def add(self, figures: Figures, series: Sequence[str], newly_only: bool) -> None:
-        """Counts sets.
+    def add(self, metrics: InstantMetrics, models: Sequence[str], newly_only: bool) -> None:
+        """Add settled sets.
 
         Args:
-            figures: P instants.
-            series: P, whose forecasts.
-            newly_only: those that were settled just now, not all that are settled.
+            metrics: metrics of P instants.
+            models: [P], the model of each instant's forecasts.
+            newly_only: True: only the sets that the call settled; False: all settled sets.
         """
-        counted = figures.newly if newly_only else figures.settled & figures.complete
-        names = np.array(series, dtype=object)
-        for name in dict.fromkeys(names[counted]):
-            rows = np.flatnonzero(counted & (names == name))
-            self.models.setdefault(name, ModelSums()).add(figures, rows)
+        selected = metrics.newly if newly_only else metrics.settled & metrics.complete
+        names = np.array(models, dtype=object)
+        for name in dict.fromkeys(names[selected]):
+            rows = np.flatnonzero(selected & (names == name))
+            self.models.setdefault(name, ModelAggregate()).add(metrics, rows)

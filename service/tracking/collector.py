@@ -1,6 +1,6 @@
-"""Prometheus series of the track memory and of what it tells."""
+"""Prometheus metrics of the track memory and of forecast consistency."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from prometheus_client import CollectorRegistry, Counter, Histogram
@@ -9,7 +9,7 @@ from prometheus_client.registry import Collector
 
 from model.arrays import Floats
 from model.metrics.convergence import RANGES_M
-from service.tracking.aggregates import CONVERGENCES, DISPERSIONS, ERRORS, ModelSums, Sums
+from service.tracking.aggregates import CONVERGENCES, DISPERSIONS, ERRORS, Aggregates, ModelAggregate
 from service.tracking.metrics import AGES_S
 
 _STORE_SECONDS = (0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
@@ -18,10 +18,10 @@ _CONVERGENCE_SECONDS = np.append(0.0, AGES_S)
 
 
 class StoreMetrics:
-    """Of the calls to the track memory.
+    """Metrics of the calls to the track memory.
 
     Args:
-        registry: where they are shown.
+        registry: registry that exports them.
     """
 
     def __init__(self, registry: CollectorRegistry) -> None:
@@ -40,33 +40,36 @@ class StoreMetrics:
         )
 
     def observe(self, op: str, seconds: float) -> None:
-        """A call ended."""
+        """Record the duration of a call."""
         self._seconds.labels(op).observe(seconds)
 
     def failed(self, op: str, reason: str) -> None:
-        """None came in time."""
+        """Count a call that failed or was late."""
         self._errors.labels(op, reason).inc()
 
 
 class ConsistencyCollector(Collector):
-    """Shows ``Sums`` as histograms when they are asked for: to count each of the 18 figures of each agent in
-    each call would take longer than to find them.
+    """Exports ``Aggregates`` as histograms.
+
+    The histograms are computed at each scrape, from the aggregates as they are: adding the 18 metrics of each
+    agent to Prometheus histograms in each call would take longer than computing them. A scrape changes
+    nothing.
 
     Args:
-        sums: gives those of the settled sets.
+        aggregates: aggregates of the settled sets.
     """
 
-    def __init__(self, sums: Callable[[], Sums]) -> None:
-        self._sums = sums
+    def __init__(self, aggregates: Aggregates) -> None:
+        self._aggregates = aggregates
 
     def collect(self) -> Iterable[Metric]:
-        """The series, by model; versions of one name are added up."""
-        apart = HistogramMetricFamily(
+        """Return the metrics by model name; the versions of a model are added up."""
+        dispersion = HistogramMetricFamily(
             "forecast_dispersion_meters",
             "Standard deviation of the distances to their barycentre of all ages' forecasts for one instant.",
             labels=["model"],
         )
-        converged = HistogramMetricFamily(
+        convergence = HistogramMetricFamily(
             "forecast_convergence_seconds",
             "Since when all forecasts for an instant had been within tau meters of what was observed.",
             labels=["model", "tau"],
@@ -76,26 +79,26 @@ class ConsistencyCollector(Collector):
             "Distance of the most likely forecast made horizon seconds ahead to what was observed.",
             labels=["model", "horizon"],
         )
-        by_name: dict[str, list[ModelSums]] = {}
-        for series, sums in self._sums().models.items():
-            by_name.setdefault(series.partition("@")[0], []).append(sums)
-        for name, parts in sorted(by_name.items()):
-            _add(apart, [name], parts, DISPERSIONS[0], _METERS)
-            for range_m, figure in zip(RANGES_M, CONVERGENCES, strict=True):
-                _add(converged, [name, f"{range_m:g}"], parts, figure, _CONVERGENCE_SECONDS)
-            for age, figure in zip(AGES_S.tolist(), ERRORS, strict=True):
-                _add(errors, [name, f"{age:g}"], parts, figure, _METERS)
-        return apart, converged, errors
+        by_name: dict[str, list[ModelAggregate]] = {}
+        for model, aggregate in self._aggregates.models.items():
+            by_name.setdefault(model.partition("@")[0], []).append(aggregate)
+        for name, versions in sorted(by_name.items()):
+            _add(dispersion, [name], versions, DISPERSIONS[0], _METERS)
+            for range_m, metric in zip(RANGES_M, CONVERGENCES, strict=True):
+                _add(convergence, [name, f"{range_m:g}"], versions, metric, _CONVERGENCE_SECONDS)
+            for age, metric in zip(AGES_S.tolist(), ERRORS, strict=True):
+                _add(errors, [name, f"{age:g}"], versions, metric, _METERS)
+        return dispersion, convergence, errors
 
 
 def _add(
     family: HistogramMetricFamily,
     labels: Sequence[str],
-    parts: Sequence[ModelSums],
-    figure: int,
+    versions: Sequence[ModelAggregate],
+    metric: int,
     bounds: Floats,
 ) -> None:
-    counts = np.sum([part.up_to(figure, bounds) for part in parts], axis=0)
+    counts = np.sum([version.count_up_to(metric, bounds) for version in versions], axis=0)
     buckets = [(f"{bound:g}", count) for bound, count in zip(bounds.tolist(), counts.tolist(), strict=True)]
-    buckets.append(("+Inf", sum(part.instants for part in parts)))
-    family.add_metric(labels, buckets=buckets, sum_value=sum(part.sum(figure) for part in parts))
+    buckets.append(("+Inf", sum(version.instants for version in versions)))
+    family.add_metric(labels, buckets=buckets, sum_value=sum(version.sum(metric) for version in versions))

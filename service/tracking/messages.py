@@ -1,4 +1,4 @@
-"""Figures into the contract's messages."""
+"""Messages of the contract, from what the track memory holds."""
 
 import math
 from collections.abc import Sequence
@@ -6,46 +6,64 @@ from collections.abc import Sequence
 from cab.forecast.v1 import consistency_service_pb2 as pb
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from model.metrics.convergence import RANGES_M
-from service.tracking.aggregates import CONVERGENCES, DISPERSIONS, ERRORS, ModelSums, Sums
-from service.tracking.metrics import AGES_S, Figures
+from service.tracking.aggregates import CONVERGENCES, DISPERSIONS, ERRORS, Aggregates, ModelAggregate
+from service.tracking.metrics import AGES_S, InstantMetrics
 from service.tracking.model_references import ModelReferences
-from service.tracking.quantile_sketch import Spread
+from service.tracking.quantile_sketch import Distribution
+from service.tracking.store.base import SceneStatus, TrackStatus
+
+AGENT_TRACKING = {
+    TrackStatus.KEPT: pb.TRACKING_STATUS_OK,
+    TrackStatus.NEW: pb.TRACKING_STATUS_NEW,
+    TrackStatus.RESET: pb.TRACKING_STATUS_RESET,
+}
+"""Tracking status of an agent in the contract."""
+SCENE_TRACKING = {
+    SceneStatus.KEPT: pb.TRACKING_STATUS_OK,
+    SceneStatus.NEW: pb.TRACKING_STATUS_NEW,
+    SceneStatus.LOST: pb.TRACKING_STATUS_RESET,
+}
+"""Tracking status of a scene in the contract."""
 
 _QUANTILES = (0.5, 0.9, 0.99)
 
 
 def instant_messages(
-    figures: Figures, agent_ids: Sequence[str], series: Sequence[str], references: ModelReferences
+    metrics: InstantMetrics, agent_ids: Sequence[str], models: Sequence[str], references: ModelReferences
 ) -> list[pb.InstantConsistency]:
-    """P messages.
+    """Return one message per instant.
 
     Args:
-        figures: of P instants.
-        agent_ids: P, whose observations.
-        series: P, whose forecasts.
+        metrics: metrics of P instants.
+        agent_ids: [P], the observed agents.
+        models: [P], the models that made the forecasts.
         references: references to models.
     """
-    errors, nearest = figures.errors_m.tolist(), figures.nearest.tolist()
-    convergence = figures.convergence_s.tolist()
-    apart = [values.tolist() for values in figures.dispersion[:3]]
-    columns = (figures.time, figures.complete, figures.settled)
+    errors, nearest = metrics.errors_m.tolist(), metrics.nearest.tolist()
+    convergence = metrics.convergence_s.tolist()
+    dispersion = [values.tolist() for values in metrics.dispersion[:3]]
+    columns = (metrics.time, metrics.complete, metrics.settled)
     rows = zip(*(column.tolist() for column in columns), strict=True)
     messages = []
     for row, (time, complete, settled) in enumerate(rows):
         message = pb.InstantConsistency(
             agent_id=agent_ids[row],
             time=time,
-            model=references.get(series[row]),
+            model=references.get(models[row]),
             complete=complete,
             settled=settled,
             errors=[
-                pb.AgeError(age=age, displacement_error=error, most_likely_was_nearest=right)
-                for age, error, right in zip(AGES_S.tolist(), errors[row], nearest[row], strict=True)
+                pb.AgeError(
+                    age=age, displacement_error=error, most_likely_was_nearest=most_likely_was_nearest
+                )
+                for age, error, most_likely_was_nearest in zip(
+                    AGES_S.tolist(), errors[row], nearest[row], strict=True
+                )
                 if not math.isnan(error)
             ],
         )
         if complete:
-            std, mean, rms = (values[row] for values in apart)
+            std, mean, rms = (values[row] for values in dispersion)
             message.dispersion.standard_deviation = std
             message.dispersion.mean = mean
             message.dispersion.root_mean_square = rms
@@ -57,41 +75,45 @@ def instant_messages(
     return messages
 
 
-def model_messages(sums: Sums, references: ModelReferences) -> list[pb.ModelConsistency]:
-    """One message a model that has a settled set, by name and version."""
+def model_messages(aggregates: Aggregates, references: ModelReferences) -> list[pb.ModelConsistency]:
+    """Return one message per model with a settled set, by name and version."""
     return [
-        _model_message(sums.models[name], references.get(name))
-        for name in sorted(sums.models)
-        if sums.models[name].instants
+        _model_message(aggregates.models[name], references.get(name))
+        for name in sorted(aggregates.models)
+        if aggregates.models[name].instants
     ]
 
 
-def _model_message(sums: ModelSums, reference: models_pb.ModelReference) -> pb.ModelConsistency:
-    summaries = [_summary(sums.spread(figure, _QUANTILES)) for figure in range(ERRORS.stop)]
-    std, mean, rms = (summaries[figure] for figure in DISPERSIONS)
+def _model_message(aggregate: ModelAggregate, reference: models_pb.ModelReference) -> pb.ModelConsistency:
+    summaries = [_summary(aggregate.summarize(metric, _QUANTILES)) for metric in range(ERRORS.stop)]
+    std, mean, rms = (summaries[metric] for metric in DISPERSIONS)
     return pb.ModelConsistency(
         model=reference,
-        instants=sums.instants,
+        instants=aggregate.instants,
         dispersion_standard_deviation=std,
         dispersion_mean=mean,
         dispersion_root_mean_square=rms,
         convergence=[
-            pb.ConvergenceSummary(range=range_m, duration=summaries[figure])
-            for range_m, figure in zip(RANGES_M, CONVERGENCES, strict=True)
+            pb.ConvergenceSummary(range=range_m, duration=summaries[metric])
+            for range_m, metric in zip(RANGES_M, CONVERGENCES, strict=True)
         ],
         errors=[
             pb.AgeSummary(
                 age=age,
-                displacement_error=summaries[figure],
-                most_likely_was_nearest=sums.nearest(number),
+                displacement_error=summaries[metric],
+                most_likely_was_nearest=aggregate.nearest_share(index),
             )
-            for number, (age, figure) in enumerate(zip(AGES_S.tolist(), ERRORS, strict=True))
+            for index, (age, metric) in enumerate(zip(AGES_S.tolist(), ERRORS, strict=True))
         ],
     )
 
 
-def _summary(spread: Spread) -> pb.Summary:
-    median, high, highest = spread.quantiles.tolist()
+def _summary(distribution: Distribution) -> pb.Summary:
+    median, quantile_90, quantile_99 = distribution.quantiles.tolist()
     return pb.Summary(
-        count=spread.count, mean=spread.mean, median=median, quantile_90=high, quantile_99=highest
+        count=distribution.count,
+        mean=distribution.mean,
+        median=median,
+        quantile_90=quantile_90,
+        quantile_99=quantile_99,
     )

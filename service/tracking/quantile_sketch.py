@@ -1,4 +1,4 @@
-"""Distributions of many numbers, in little room and for many at once."""
+"""Quantile sketches: distributions of many numbers in constant memory."""
 
 from dataclasses import dataclass
 
@@ -8,39 +8,40 @@ from model.arrays import Floats, Ints
 
 _ACCURACY = 0.01
 _GAMMA = (1 + _ACCURACY) / (1 - _ACCURACY)
-_LEAST, _MOST = 1e-4, 1e6
-"""What is smaller counts as 0, what is greater as that."""
+_MIN, _MAX = 1e-4, 1e6
+"""Bounds of the bins: smaller numbers count as 0, greater ones as the maximum."""
 _LOG_GAMMA = np.log(_GAMMA)
-_FIRST = int(np.ceil(np.log(_LEAST) / _LOG_GAMMA))
-_BINS = int(np.ceil(np.log(_MOST) / _LOG_GAMMA)) - _FIRST + 2
+_FIRST = int(np.ceil(np.log(_MIN) / _LOG_GAMMA))
+_BINS = int(np.ceil(np.log(_MAX) / _LOG_GAMMA)) - _FIRST + 2
 _VALUES = np.concatenate([[0.0], 2 / (_GAMMA + 1) * _GAMMA ** (_FIRST + np.arange(_BINS - 1))])
 
 
 @dataclass(frozen=True)
-class Spread:
-    """One distribution."""
+class Distribution:
+    """Summary of one distribution."""
 
     count: int
     mean: float
     quantiles: Floats
-    """Those that were asked for, to 1 % of their value."""
+    """Requested quantiles, to 1 % of their value."""
 
 
-class Sketches:
-    """F distributions of numbers ≥ 0 side by side: logarithmic bins, which hold every quantile to 1 % of its
-    value (DDSketch, Masson et al. 2019). The library of that name takes one call a number, and Predict has
-    500 of them.
+class QuantileSketches:
+    """F distributions of numbers ≥ 0, updated together.
+
+    The bins are logarithmic, which keeps each quantile within 1 % of its value (DDSketch, Masson et al.
+    2019). The ``ddsketch`` library takes one call per number, and a Predict call has 500 of them.
 
     Args:
-        figures: F.
+        count: F.
     """
 
-    def __init__(self, figures: int) -> None:
-        self._bins: Ints = np.zeros((figures, _BINS), dtype=np.int64)
-        self._sums = np.zeros(figures)
+    def __init__(self, count: int) -> None:
+        self._bins: Ints = np.zeros((count, _BINS), dtype=np.int64)
+        self._sums = np.zeros(count)
 
     def add(self, values: Floats) -> None:
-        """Counts numbers.
+        """Add one number to each distribution, N times.
 
         Args:
             values: [N, F], finite.
@@ -48,35 +49,37 @@ class Sketches:
         np.add.at(self._bins, (np.arange(values.shape[1])[None, :], _bin(values)), 1)
         self._sums += values.sum(axis=0)
 
-    def spread(self, figure: int, quantiles: tuple[float, ...]) -> Spread:
-        """One distribution as it is; all zeros when it is empty.
+    def summarize(self, index: int, quantiles: tuple[float, ...]) -> Distribution:
+        """Return the summary of one distribution; all zeros if it is empty.
 
         Args:
-            figure: its number.
+            index: number of the distribution.
             quantiles: each in [0, 1].
         """
-        bins = self._bins[figure]
+        bins = self._bins[index]
         count = int(bins.sum())
         if not count:
-            return Spread(0, 0.0, np.zeros(len(quantiles)))
+            return Distribution(0, 0.0, np.zeros(len(quantiles)))
         ranks = np.ceil(np.array(quantiles) * count).clip(1, count)
-        return Spread(
-            count, float(self._sums[figure]) / count, _VALUES[np.searchsorted(bins.cumsum(), ranks)]
+        return Distribution(
+            count, float(self._sums[index]) / count, _VALUES[np.searchsorted(bins.cumsum(), ranks)]
         )
 
-    def up_to(self, figure: int, bounds: Floats) -> Ints:
-        """How many numbers are at most each bound; one that is up to 2 % above it may be among them.
+    def count_up_to(self, index: int, bounds: Floats) -> Ints:
+        """Return how many numbers are at most each bound, [B].
+
+        Numbers up to 2 % above a bound may be included.
 
         Args:
-            figure: its number.
+            index: number of the distribution.
             bounds: [B].
         """
-        counts: Ints = self._bins[figure].cumsum()[_bin(bounds)]
+        counts: Ints = self._bins[index].cumsum()[_bin(bounds)]
         return counts
 
-    def sum(self, figure: int) -> float:
-        """Of all numbers of a distribution."""
-        return float(self._sums[figure])
+    def sum(self, index: int) -> float:
+        """Return the sum of all numbers of a distribution."""
+        return float(self._sums[index])
 
 
 def _bin(values: Floats) -> Ints:

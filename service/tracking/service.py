@@ -1,4 +1,4 @@
-"""The calls about consistency, from request message to answer message; the transports only carry them."""
+"""Consistency calls, from request message to response message; transports only carry them."""
 
 import asyncio
 from collections.abc import AsyncIterator, Sequence
@@ -7,32 +7,32 @@ from cab.forecast.v1 import consistency_service_pb2 as pb
 from cab.forecast.v1.bounds import MAX_ID_LENGTH
 from service.errors import BadField, Overloaded, TrackingUnavailable, UnknownTrack, id_too_long
 from service.lifecycle import Lifecycle
-from service.tracking.aggregates import Sums
+from service.tracking.aggregates import Aggregates
 from service.tracking.messages import instant_messages, model_messages
-from service.tracking.metrics import Figures, figures
+from service.tracking.metrics import InstantMetrics, instant_metrics
 from service.tracking.model_references import ModelReferences
-from service.tracking.store.base import WINDOW, Remembered, StoreError, TrackStore
+from service.tracking.store.base import WINDOW, SceneSnapshot, StoreError, TrackStore
 from service.tracking.store.factory import MAX_WATCHERS
 from service.tracking.store.guard import Guard
-from service.tracking.tracker import PATIENCE, Tracker
+from service.tracking.tracker import STORE_TIMEOUT, Tracker
 
 DEFAULT_WINDOW = 2.0
-"""s back from an agent's newest observation."""
+"""Seconds of an agent's observations, counted back from its newest one."""
 SCENE_WINDOW = 4.0
-"""The same for the sums of a scene: what was not on its lag is settled after 2 s."""
+"""Seconds for the aggregates of a scene; longer, because off-lag forecasts settle after 2 s."""
 _WATCH_RETRY = 5.0
-"""s until a place among the watchers may be free."""
+"""Seconds until a client that was refused should try to watch again."""
 
 
 class ConsistencyService:
-    """What the track memory tells those who ask for it.
+    """Consistency of the forecasts, as the track memory knows it.
 
     Args:
-        store: the memory.
-        guard: of the calls to it.
-        tracker: the tracker of the Predict calls.
+        store: the track memory.
+        guard: guard of the calls to it.
+        tracker: tracker of the Predict calls.
         references: references to models.
-        lifecycle: the lifecycle of the server.
+        lifecycle: lifecycle of the server.
     """
 
     def __init__(
@@ -52,50 +52,58 @@ class ConsistencyService:
         self._ended = asyncio.Event()
 
     async def get_agent(self, request: pb.GetAgentConsistencyRequest) -> pb.GetAgentConsistencyResponse:
-        """One agent's last seconds.
+        """Return the consistency of one agent over its last seconds.
 
         Raises:
-            BadField: an id is missing or too long, or the window is out of its range.
-            UnknownTrack: nothing is remembered of it.
-            TrackingUnavailable: the track memory does not answer.
-            Unavailable: not ready.
+            BadField: an id is missing or too long, or the window is out of range.
+            UnknownTrack: the track memory does not know the agent.
+            TrackingUnavailable: the track memory is unavailable.
+            Unavailable: the server is not ready.
         """
         self._lifecycle.require_ready()
         _check_id("scene_id", request.scene_id)
         _check_id("agent_id", request.agent_id)
         if not 0 <= request.window <= WINDOW:
             raise BadField("window", f"must be within 0 … {WINDOW:g} s")
-        held = await self._read(request.scene_id, request.window or DEFAULT_WINDOW, request.agent_id)
-        found = await asyncio.to_thread(figures, held.instants.packed)
-        return pb.GetAgentConsistencyResponse(instants=self._messages(found, held, range(len(found))))
+        snapshot = await self._read(request.scene_id, request.window or DEFAULT_WINDOW, request.agent_id)
+        metrics = await asyncio.to_thread(instant_metrics, snapshot.instants.packed)
+        return pb.GetAgentConsistencyResponse(instants=self._messages(metrics, snapshot, range(len(metrics))))
 
     async def get_scene(self, request: pb.GetSceneConsistencyRequest) -> pb.GetSceneConsistencyResponse:
-        """A scene now. Raises as ``get_agent``."""
+        """Return the current consistency of a scene.
+
+        Raises:
+            BadField, UnknownTrack, TrackingUnavailable, Unavailable: as ``get_agent``.
+        """
         self._lifecycle.require_ready()
         _check_id("scene_id", request.scene_id)
-        held = await self._read(request.scene_id, SCENE_WINDOW)
-        found = await asyncio.to_thread(figures, held.instants.packed)
+        snapshot = await self._read(request.scene_id, SCENE_WINDOW)
+        instants = snapshot.instants
+        metrics = await asyncio.to_thread(instant_metrics, instants.packed)
         newest: dict[tuple[str, str], int] = {}
-        for row, key in enumerate(zip(held.instants.agent_ids, held.instants.series, strict=True)):
-            newest[key] = row  # by ascending time: the last one stays
-        sums = Sums()
-        sums.add(found, held.instants.series, newly_only=False)
+        for row, key in enumerate(zip(instants.agent_ids, instants.models, strict=True)):
+            newest[key] = row  # rows ascend by time, so the last one remains
+        aggregates = Aggregates()
+        aggregates.add(metrics, instants.models, newly_only=False)
         return pb.GetSceneConsistencyResponse(
-            latest=self._messages(found, held, [newest[key] for key in sorted(newest)]),
-            models=model_messages(sums, self._references),
+            latest=self._messages(metrics, snapshot, [newest[key] for key in sorted(newest)]),
+            models=model_messages(aggregates, self._references),
         )
 
     async def list_models(self, request: pb.ListModelConsistencyRequest) -> pb.ListModelConsistencyResponse:
-        """Sums over the process's life.
+        """Return the aggregates over the lifetime of the process, by model.
 
         Raises:
-            Unavailable: not ready.
+            Unavailable: the server is not ready.
         """
         self._lifecycle.require_ready()
-        return pb.ListModelConsistencyResponse(models=model_messages(self._tracker.sums(), self._references))
+        self._tracker.aggregate_pending()
+        return pb.ListModelConsistencyResponse(
+            models=model_messages(self._tracker.aggregates, self._references)
+        )
 
     async def reset_scene(self, request: pb.ResetSceneRequest) -> pb.ResetSceneResponse:
-        """Forgets a scene.
+        """Delete a scene from the track memory.
 
         Raises:
             BadField, TrackingUnavailable, Unavailable: as ``get_agent``.
@@ -103,17 +111,19 @@ class ConsistencyService:
         self._lifecycle.require_ready()
         _check_id("scene_id", request.scene_id)
         try:
-            agents = await self._guard.run("reset", lambda: self._store.reset(request.scene_id), PATIENCE)
+            agents = await self._guard.run(
+                "reset", lambda: self._store.reset(request.scene_id), STORE_TIMEOUT
+            )
         except StoreError as error:
             raise TrackingUnavailable(str(error)) from error
         return pb.ResetSceneResponse(agents=agents)
 
     async def watch_scene(self, request: pb.WatchSceneRequest) -> AsyncIterator[pb.WatchSceneResponse]:
-        """Events of a scene until the caller closes the iterator or the server drains.
+        """Yield events of a scene until the caller closes the iterator or the server drains.
 
         Raises:
             BadField, TrackingUnavailable, Unavailable: as ``get_agent``.
-            Overloaded: too many watch.
+            Overloaded: there are too many watchers.
         """
         self._lifecycle.require_ready()
         _check_id("scene_id", request.scene_id)
@@ -124,15 +134,15 @@ class ConsistencyService:
         ended = asyncio.ensure_future(self._ended.wait())
         try:
             while not self._ended.is_set():
-                coming = asyncio.ensure_future(anext(source))
+                next_events = asyncio.ensure_future(anext(source))
                 try:
-                    await asyncio.wait({coming, ended}, return_when=asyncio.FIRST_COMPLETED)
-                    if not coming.done():
+                    await asyncio.wait({next_events, ended}, return_when=asyncio.FIRST_COMPLETED)
+                    if not next_events.done():
                         return
-                    events, missed = coming.result()
+                    events, missed = next_events.result()
                 finally:
-                    coming.cancel()
-                    await asyncio.gather(coming, return_exceptions=True)
+                    next_events.cancel()
+                    await asyncio.gather(next_events, return_exceptions=True)
                 instants = [pb.InstantConsistency.FromString(event) for event in events]
                 yield pb.WatchSceneResponse(instants=instants, missed=missed)
         except StopAsyncIteration:
@@ -145,25 +155,28 @@ class ConsistencyService:
             await source.aclose()
 
     def end_watching(self) -> None:
-        """Ends all that watch."""
+        """End all ``watch_scene`` calls."""
         self._ended.set()
 
-    async def _read(self, scene_id: str, window: float, agent_id: str | None = None) -> Remembered:
+    async def _read(self, scene_id: str, window: float, agent_id: str | None = None) -> SceneSnapshot:
         try:
-            held = await self._guard.run(
-                "read", lambda: self._store.read(scene_id, window, agent_id), PATIENCE
+            snapshot = await self._guard.run(
+                "read", lambda: self._store.read(scene_id, window, agent_id), STORE_TIMEOUT
             )
         except StoreError as error:
             raise TrackingUnavailable(str(error)) from error
-        if not held.agent_ids:
-            whose = "this scene" if agent_id is None else "this agent"
-            raise UnknownTrack(f"nothing is remembered of {whose}")
-        return held
+        if not snapshot.agent_ids:
+            unknown = "this scene" if agent_id is None else "this agent"
+            raise UnknownTrack(f"nothing is remembered of {unknown}")
+        return snapshot
 
-    def _messages(self, found: Figures, held: Remembered, rows: Sequence[int]) -> list[pb.InstantConsistency]:
-        of = held.instants
-        ids, series = [of.agent_ids[row] for row in rows], [of.series[row] for row in rows]
-        return instant_messages(found.rows(rows), ids, series, self._references)
+    def _messages(
+        self, metrics: InstantMetrics, snapshot: SceneSnapshot, rows: Sequence[int]
+    ) -> list[pb.InstantConsistency]:
+        instants = snapshot.instants
+        agent_ids = [instants.agent_ids[row] for row in rows]
+        models = [instants.models[row] for row in rows]
+        return instant_messages(metrics.rows(rows), agent_ids, models, self._references)
 
 
 def _check_id(field: str, value: str) -> None:

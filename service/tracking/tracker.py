@@ -1,4 +1,4 @@
-"""The track memory as the calls of Predict use it: never in the way of a forecast."""
+"""Track memory of the Predict calls: it never delays a forecast."""
 
 import asyncio
 from collections.abc import Sequence
@@ -7,48 +7,47 @@ from dataclasses import dataclass, field
 from time import perf_counter
 
 from cab.forecast.v1 import consistency_service_pb2 as pb
-from service.tracking.aggregates import Sums
-from service.tracking.messages import instant_messages
-from service.tracking.metrics import figures
+from service.tracking.aggregates import Aggregates
+from service.tracking.messages import AGENT_TRACKING, SCENE_TRACKING, instant_messages
+from service.tracking.metrics import instant_metrics
 from service.tracking.model_references import ModelReferences
-from service.tracking.statuses import OF_AGENT, OF_SCENE
-from service.tracking.store.base import Recalled, Sighting, StoreError, TrackStore
+from service.tracking.store.base import ExchangeResult, StoreError, TrackStore, TrackUpdate
 from service.tracking.store.guard import Guard
 
-PATIENCE = 2.0
-"""s that those who do not forecast wait for the track memory."""
-_ASIDE = 0.002
-"""s after which what calls settled is counted."""
+STORE_TIMEOUT = 2.0
+"""Seconds that calls other than Predict wait for the track memory."""
+_AGGREGATION_DELAY = 0.002
+"""Seconds until the sets that a call settled are aggregated; the response goes out first."""
 
 
 @dataclass
-class Tracked:
-    """What the memory said in one call."""
+class TrackingResult:
+    """Result of one exchange with the track memory."""
 
     status: "pb.TrackingStatus.ValueType" = pb.TRACKING_STATUS_UNAVAILABLE
     agents: "dict[str, pb.TrackingStatus.ValueType]" = field(default_factory=dict)
-    """By id; empty where the memory did not answer."""
+    """Status by agent id; empty if the memory was unavailable."""
     histories: dict[str, bytes] = field(default_factory=dict)
-    """By id, if they were asked for."""
+    """History by agent id, if requested."""
     latest: dict[str, pb.InstantConsistency] = field(default_factory=dict)
-    """By id: the newest observation, if it was asked for."""
+    """Consistency at the newest observation by agent id, if requested."""
     seconds: float = 0.0
-    """s that the call waited for it."""
+    """Seconds that the call waited for the memory."""
 
     @property
     def answered(self) -> bool:
-        """Whether there was an answer in time."""
+        """Whether the memory answered in time."""
         return self.status != pb.TRACKING_STATUS_UNAVAILABLE
 
 
 class Tracker:
-    """Remembers what calls bring, and counts what it finds out.
+    """Stores the updates of Predict calls and aggregates the sets that they settle.
 
     Args:
-        store: the memory.
-        guard: of the calls to it that forecasts wait for.
-        asking: of the others.
-        budget: s that a call waits for the memory.
+        store: the track memory.
+        guard: guard of the exchanges, which forecasts wait for.
+        query_guard: guard of all other calls to the store.
+        budget: seconds that an exchange may take.
         references: references to models.
     """
 
@@ -56,132 +55,140 @@ class Tracker:
         self,
         store: TrackStore,
         guard: Guard,
-        asking: Guard,
+        query_guard: Guard,
         budget: float,
         references: ModelReferences,
     ) -> None:
-        self._sums = Sums()
+        self.aggregates = Aggregates()
+        """Aggregates over the lifetime of the process, without the pending sets."""
         self._store = store
         self._guard = guard
-        self._asking = asking
+        self._query_guard = query_guard
         self._budget = budget
         self._references = references
-        self._telling: dict[str, asyncio.Task[None]] = {}
-        """The last of each scene that is told of something."""
-        self._due: list[tuple[str, Recalled]] = []
-        """What is still to be counted."""
+        self._publishing: dict[str, asyncio.Task[None]] = {}
+        """Last publication of each scene."""
+        self._pending: list[tuple[str, ExchangeResult]] = []
+        """Results to aggregate, with the ids of their scenes."""
 
-    def sums(self) -> Sums:
-        """What was settled over the process's life, by model."""
-        self._count()
-        return self._sums
+    def aggregate_pending(self) -> None:
+        """Aggregate what earlier calls left pending."""
+        pending, self._pending = self._pending, []
+        for scene_id, result in pending:
+            self._aggregate(scene_id, result, latest=False)
 
     async def exchange(
         self,
         scene_id: str,
         time: float,
-        sightings: Sequence[Sighting],
-        patience: float,
-        recall: float | None = None,
+        updates: Sequence[TrackUpdate],
+        time_left: float,
+        history_s: float | None = None,
         latest: bool = False,
-    ) -> Tracked:
-        """Remembers what a call brings; says so where the memory does not answer in time.
+    ) -> TrackingResult:
+        """Store the updates of a call.
+
+        Store failures do not raise: the status of the result is UNAVAILABLE.
 
         Args:
-            scene_id: of the call.
-            time: of the call, s.
-            sightings: its agents.
-            patience: s that the call has left; what waits for the memory must not cost it its forecasts.
-            recall: s of history that are wanted; None: none is.
-            latest: whether the consistency at the newest observations is wanted.
+            scene_id: the scene.
+            time: time of the call, s.
+            updates: updates of its agents.
+            time_left: seconds that the call can wait without missing its deadline.
+            history_s: seconds of history to return; None: no histories.
+            latest: whether to return the consistency at the newest observations.
         """
         started = perf_counter()
-        tracked = Tracked()
+        tracking = TrackingResult()
 
         try:
-            recalled = await self._guard.run(
+            result = await self._guard.run(
                 "exchange",
-                lambda: self._store.exchange(scene_id, time, sightings, recall),
+                lambda: self._store.exchange(scene_id, time, updates, history_s),
                 self._budget,
-                patience_s=max(patience, 0.0),
-                late=lambda recalled: self._put_off(scene_id, recalled),
+                time_left_s=max(time_left, 0.0),
+                late=lambda result: self._aggregate_later(scene_id, result),
             )
         except StoreError:
-            tracked.seconds = perf_counter() - started
-            return tracked
-        tracked.status = OF_SCENE[recalled.event]
-        ids = [one.agent_id for one in sightings]
-        tracked.agents = {one: OF_AGENT[fate] for one, fate in zip(ids, recalled.fates, strict=True)}
-        tracked.histories = dict(zip(ids, recalled.histories, strict=False))
+            tracking.seconds = perf_counter() - started
+            return tracking
+        tracking.status = SCENE_TRACKING[result.scene_status]
+        ids = [update.agent_id for update in updates]
+        tracking.agents = {
+            agent_id: AGENT_TRACKING[status]
+            for agent_id, status in zip(ids, result.track_statuses, strict=True)
+        }
+        tracking.histories = dict(zip(ids, result.histories, strict=False))
         if latest:
-            messages = self._take(scene_id, recalled, latest)
-            tracked.latest = _newest(sightings, recalled.instants.series, messages)
+            messages = self._aggregate(scene_id, result, latest)
+            tracking.latest = _newest(updates, result.instants.models, messages)
         else:
-            self._put_off(scene_id, recalled)
-        tracked.seconds = perf_counter() - started
-        return tracked
+            self._aggregate_later(scene_id, result)
+        tracking.seconds = perf_counter() - started
+        return tracking
 
-    def _put_off(self, scene_id: str, recalled: Recalled) -> None:
-        """Has it counted when the answer is out, which need not wait for it."""
-        if not recalled.instants.series:
+    def _aggregate_later(self, scene_id: str, result: ExchangeResult) -> None:
+        """Aggregate a result after the response has gone out."""
+        if not result.instants.models:
             return
-        if not self._due:
-            asyncio.get_running_loop().call_later(_ASIDE, self._count)
-        self._due.append((scene_id, recalled))
+        if not self._pending:
+            asyncio.get_running_loop().call_later(_AGGREGATION_DELAY, self.aggregate_pending)
+        self._pending.append((scene_id, result))
 
-    def _count(self) -> None:
-        due, self._due = self._due, []
-        for scene_id, recalled in due:
-            self._take(scene_id, recalled, latest=False)
+    def _aggregate(self, scene_id: str, result: ExchangeResult, latest: bool) -> list[pb.InstantConsistency]:
+        """Aggregate the newly settled sets and publish all instants to the watchers.
 
-    def _take(self, scene_id: str, recalled: Recalled, latest: bool) -> list[pb.InstantConsistency]:
-        """Counts what was settled and tells those who watch; messages of all instants, if they are wanted."""
-        instants = recalled.instants
-        if not instants.series:
+        Returns:
+            Messages of all instants, if ``latest`` or the watchers need them.
+        """
+        instants = result.instants
+        if not instants.models:
             return []
-        found = figures(instants.packed)
-        if found.newly.any():
-            self._sums.add(found, instants.series, newly_only=True)
-        if not (latest or recalled.watched):
+        metrics = instant_metrics(instants.packed)
+        if metrics.newly.any():
+            self.aggregates.add(metrics, instants.models, newly_only=True)
+        if not (latest or result.watched):
             return []
-        messages = instant_messages(found, instants.agent_ids, instants.series, self._references)
-        if recalled.watched:
-            self._tell(scene_id, [message.SerializeToString() for message in messages])
+        messages = instant_messages(metrics, instants.agent_ids, instants.models, self._references)
+        if result.watched:
+            self._publish_later(scene_id, [message.SerializeToString() for message in messages])
         return messages
 
-    def _tell(self, scene_id: str, events: Sequence[bytes]) -> None:
-        """Tells those who watch, after what they were told before; no call waits for it."""
-        telling = asyncio.create_task(self._publish(scene_id, events, self._telling.get(scene_id)))
-        self._telling[scene_id] = telling
-        telling.add_done_callback(lambda told: self._told(scene_id, told))
+    def _publish_later(self, scene_id: str, events: Sequence[bytes]) -> None:
+        """Publish events in the background, after the scene's earlier ones."""
+        task = asyncio.create_task(self._publish(scene_id, events, self._publishing.get(scene_id)))
+        self._publishing[scene_id] = task
+        task.add_done_callback(lambda task: self._published(scene_id, task))
 
     async def _publish(
-        self, scene_id: str, events: Sequence[bytes], before: "asyncio.Task[None] | None"
+        self, scene_id: str, events: Sequence[bytes], previous: "asyncio.Task[None] | None"
     ) -> None:
-        if before is not None:
-            await asyncio.wait((before,))
-        with suppress(StoreError):  # the guard has counted it
-            await self._asking.run("publish", lambda: self._store.publish(scene_id, events), PATIENCE)
+        if previous is not None:
+            await asyncio.wait((previous,))
+        with suppress(StoreError):  # the guard counts and logs it
+            await self._query_guard.run(
+                "publish", lambda: self._store.publish(scene_id, events), STORE_TIMEOUT
+            )
 
-    def _told(self, scene_id: str, told: "asyncio.Task[None]") -> None:
-        if self._telling.get(scene_id) is told:
-            del self._telling[scene_id]
+    def _published(self, scene_id: str, task: "asyncio.Task[None]") -> None:
+        if self._publishing.get(scene_id) is task:
+            del self._publishing[scene_id]
 
 
 def _newest(
-    sightings: Sequence[Sighting], series: Sequence[str], messages: Sequence[pb.InstantConsistency]
+    updates: Sequence[TrackUpdate], models: Sequence[str], messages: Sequence[pb.InstantConsistency]
 ) -> dict[str, pb.InstantConsistency]:
-    """Of each agent the last instant of the series that the call is about.
+    """Return the newest instant of each agent, for the model of its update.
 
     Args:
-        sightings: what the call brought.
-        series: of each message.
-        messages: of all that the memory told.
+        updates: updates of the call.
+        models: [P], the model of each message.
+        messages: [P].
     """
-    asked = {one.agent_id: one.series for one in sightings}
+    requested = {update.agent_id: update.model for update in updates}
     newest: dict[str, pb.InstantConsistency] = {}
-    for name, message in zip(series, messages, strict=True):
+    for model, message in zip(models, messages, strict=True):
         known = newest.get(message.agent_id)
-        if asked.get(message.agent_id) == name and (known is None or message.time > known.time):
+        if requested.get(message.agent_id) == model and (known is None or message.time > known.time):
             newest[message.agent_id] = message
     return newest

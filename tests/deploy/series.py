@@ -10,7 +10,7 @@ from cab.forecast.v1 import prediction_service_pb2 as pb
 from cab_forecast import scene_raster
 from service import errors
 from service.server import Server
-from service.tracking.store.failures import Reason
+from service.tracking.store.failures import FailureReason
 from tests.service.fakes import FakeForecaster
 from tests.service.requests import make_request
 from tests.service.servers import call_grpc, call_rest, running
@@ -43,7 +43,7 @@ async def exported() -> dict[str, Labels]:
     async with running(FakeForecaster(_MODEL), store=_NOWHERE, **_PATIENT) as server:
         await call_grpc(server, tracks.request(1, _MODEL))
         _add(found, server)
-    found["forecast_track_store_errors_total"]["reason"].update(Reason)
+    found["forecast_track_store_errors_total"]["reason"].update(FailureReason)
     kinds = [kind for kind in vars(errors).values() if isinstance(kind, type)]
     codes = {kind.code for kind in kinds if issubclass(kind, errors.ServiceError)}
     found["forecast_requests_total"]["code"].update(codes)

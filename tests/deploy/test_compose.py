@@ -10,8 +10,8 @@ from service.environment import PREFIX
 from service.settings import Settings, load, split_address
 from tests.deploy.files import DEPLOY, ROOT, job_name, read_yaml
 from tests.service.tracking.store.redis_servers import single
-from tests.service.tracking.store.sightings import START, sighting
 from tests.service.tracking.store.stores import opened, scene_name
+from tests.service.tracking.store.track_updates import START, track_update
 
 SERVICES: dict[str, Any] = read_yaml(ROOT / "docker-compose.yml")["services"]
 MANIFESTS = list(yaml.safe_load_all((DEPLOY / "kubernetes/forecast.yml").read_text(encoding="utf-8")))
@@ -89,7 +89,7 @@ async def test_redis_understands_its_options_and_all_that_is_in_it_expires() -> 
         async with opened(redis.url) as store:
             watching = store.watch(scene)
             await anext(watching)
-            await store.exchange(scene, START, [sighting(START)])
+            await store.exchange(scene, START, [track_update(START)])
             await store.publish(scene, [b"event"])
             await watching.aclose()
         keys = redis.command("KEYS", "*")

@@ -1,1 +1,1 @@
-"""Stores of the track memory: this process or Redis, behind one interface."""
+"""Stores of the track memory: in-process or Redis, behind one interface."""

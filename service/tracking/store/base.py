@@ -1,4 +1,4 @@
-"""What a track memory does, whichever it is."""
+"""Interface of the track memory, which every store implements."""
 
 from abc import ABC, abstractmethod
 from collections.abc import AsyncGenerator, Sequence
@@ -7,163 +7,168 @@ from enum import Enum, IntEnum
 from typing import NamedTuple
 
 WINDOW = 10.5
-"""s before a scene's newest call that are remembered: 6.1 s of forecasts, 2 s until a set is settled, 2 s for
-calls that come late, and some room."""
+"""Seconds before a scene's newest call that are kept: 6.1 s of forecasts, 2 s until a set settles, 2 s for
+late calls, and a margin."""
 AGE_TOLERANCE = 0.09
-"""s that a forecast may have been made off its lag of k · 0.5 s: at 10 Hz none stands in for a
-lost frame's."""
+"""Seconds between the time of a forecast and its lag of k · 0.5 s, at most. At 10 Hz, no forecast replaces
+that of a lost frame."""
 LATENESS = 2.0
-"""s before a scene's newest call that another may come. An earlier one is of a clock that was put back, or of
-a recording that is played again, and the scene begins anew."""
+"""Seconds that a call may be older than a scene's newest one. An older call means that the clock was set back
+or a recording was restarted, and the scene starts again."""
 SETTLE_AFTER = LATENESS
-"""s after which a complete set is final though forecasts in it were made off their lags."""
+"""Seconds after which a complete set settles even if some of its forecasts are off their lags."""
 MAX_FORECASTS = 150
-"""Forecasts of one model that are remembered of an agent, 14 a second over the window; the oldest go."""
-MAX_SERIES = 15
-"""Models whose forecasts are remembered of one agent; those of others are not."""
+"""Forecasts of one model that are kept per agent (14 per second over the window); the oldest are dropped."""
+MAX_MODELS = 15
+"""Models whose forecasts are kept per agent; forecasts of further models are dropped."""
 
 
 class StoreError(Exception):
-    """The track memory did not answer; the text says why."""
+    """Failure of the track memory; the text gives the reason."""
 
 
-class Fate(IntEnum):
-    """What became of the memory of an agent in a call."""
+class TrackStatus(IntEnum):
+    """Status of an agent's track in a call."""
 
     KEPT = 0
     NEW = 1
-    """There was none."""
+    """The agent had no track."""
     RESET = 2
-    """It did not fit and was forgotten; what the call brings is its beginning."""
+    """The track contradicted the call and was replaced by a new one."""
 
 
-class Sighting(NamedTuple):
-    """What one call brings of one agent."""
+class TrackUpdate(NamedTuple):
+    """Observations and forecast that one call adds to one agent's track."""
 
     agent_id: str
-    kind: bytes
-    """One of ``records.KINDS``."""
+    agent_type: bytes
+    """One of ``records.AGENT_TYPES``."""
     observations: bytes
     """``records.pack_observations``; may be empty."""
-    series: str = ""
-    """Which model made the forecast, name@version, or was asked for; empty: none."""
+    model: str = ""
+    """Model that made the forecast or was requested, ``name@version``; empty: none."""
     forecast: bytes = b""
-    """``records.pack_forecasts``; empty: none was made."""
+    """``records.pack_forecasts``; empty: no forecast was made."""
     steps: int = 0
-    """Of the forecast."""
+    """Steps of the forecast."""
 
 
-class Event(Enum):
-    """What became of the memory of a scene in a call."""
+class SceneStatus(Enum):
+    """Status of a scene's memory in a call."""
 
     KEPT = "kept"
-    BEGUN = "begun"
-    """There was none."""
+    NEW = "new"
+    """The scene was unknown."""
     LOST = "lost"
-    """The one that this server knew is gone; what the call brings may be the beginning of another."""
+    """The memory that this server knew is gone; the call may have started a new one."""
 
 
 @dataclass(frozen=True)
 class Instants:
-    """Observations, each with one model's forecasts for it; P of them."""
+    """P observations, each with the forecasts that one model made for it."""
 
     packed: bytes = b""
     """[P] of ``records.INSTANT``."""
     agent_ids: Sequence[str] = ()
     """[P]."""
-    series: Sequence[str] = ()
-    """[P], whose forecasts."""
+    models: Sequence[str] = ()
+    """[P], ``name@version``."""
 
 
 @dataclass(frozen=True)
-class Recalled:
-    """What a store answers to one call."""
+class ExchangeResult:
+    """Response of a store to one call."""
 
-    event: Event
-    fates: Sequence[Fate]
-    """Of each agent, in the call's order."""
+    scene_status: SceneStatus
+    track_statuses: Sequence[TrackStatus]
+    """Status of each agent, in the order of the call."""
     histories: Sequence[bytes]
-    """Of each agent, if they were asked for: observations up to the call's time, the call's own included."""
+    """Observations of each agent up to the time of the call, including its own; empty if not requested."""
     instants: Instants
-    """Of each agent with a series its newest observation in the call, and what else the call settled."""
+    """Newest observation of each agent with a model, and all instants that the call settled."""
     watched: bool
-    """Whether anybody watches the scene, on whichever server."""
+    """Whether the scene has a watcher, on any server."""
 
 
 @dataclass(frozen=True)
-class Remembered:
-    """All that is remembered of some agents of a scene."""
+class SceneSnapshot:
+    """Everything the memory holds about some agents of a scene."""
 
     agent_ids: Sequence[str]
-    """The agents."""
     instants: Instants
-    """Each observation once for each series of its agent, by ascending time within an agent."""
+    """Each observation once per model of its agent, ascending by time within an agent."""
 
 
 class TrackStore(ABC):
-    """The memory. A scene is remembered until there was no call of it for the store's expiry; of its agents
-    what the calls of the last ``WINDOW`` brought."""
+    """Track memory.
+
+    A scene expires after a time without calls. Its agents keep what the calls of the last ``WINDOW`` seconds
+    brought.
+    """
 
     @abstractmethod
     async def exchange(
-        self, scene_id: str, time: float, sightings: Sequence[Sighting], recall: float | None = None
-    ) -> Recalled:
-        """Remembers what a call brings, and tells what it completes; atomic, and one round trip.
+        self, scene_id: str, time: float, updates: Sequence[TrackUpdate], history_s: float | None = None
+    ) -> ExchangeResult:
+        """Store the updates of a call and return what they complete: atomic, and one round trip.
 
-        Of one time (to ``TIME_TOLERANCE``) and agent what came first is kept, so that a call may come twice.
+        The first observation and forecast of an agent at a time (to ``TIME_TOLERANCE``) is kept, so that a
+        call may be repeated.
 
         Args:
-            scene_id: whose agents these are.
-            time: of the call, s; the forecasts' as well.
-            sightings: each agent once.
-            recall: s before ``time`` from which on histories are told; None: not at all.
+            scene_id: the scene.
+            time: time of the call and of its forecasts, s.
+            updates: one update per agent.
+            history_s: seconds of history before ``time`` to return; None: no histories.
 
         Raises:
-            StoreError: there is no answer; what was to be remembered may be or not.
+            StoreError: the store is unavailable; the updates may or may not have been stored.
         """
 
     @abstractmethod
-    async def read(self, scene_id: str, window: float, agent_id: str | None = None) -> Remembered:
-        """What is remembered of one agent, or of all.
+    async def read(self, scene_id: str, window: float, agent_id: str | None = None) -> SceneSnapshot:
+        """Return what is stored about one agent or all agents.
 
         Args:
-            scene_id: whose.
-            window: s before an agent's newest observation from which on observations are told.
-            agent_id: which; None: all.
+            scene_id: the scene.
+            window: seconds before an agent's newest observation to return.
+            agent_id: the agent; None: all.
 
         Raises:
-            StoreError: there is no answer.
+            StoreError: the store is unavailable.
         """
 
     @abstractmethod
     async def reset(self, scene_id: str) -> int:
-        """Forgets a scene; how many agents it had.
+        """Delete a scene and return the number of its agents.
 
         Raises:
-            StoreError: there is no answer; it may have been forgotten.
+            StoreError: the store is unavailable; the scene may have been deleted.
         """
 
     @abstractmethod
     async def publish(self, scene_id: str, events: Sequence[bytes]) -> None:
-        """Tells those who watch a scene.
+        """Send events to the watchers of a scene.
 
         Args:
             scene_id: the scene.
-            events: in order.
+            events: events in order.
 
         Raises:
-            StoreError: it is not known whether they were told.
+            StoreError: the store is unavailable; the events may or may not have been sent.
         """
 
     @abstractmethod
     def watch(self, scene_id: str) -> "AsyncGenerator[tuple[Sequence[bytes], int], None]":
-        """What is published of a scene from now on, on any server of this store: events, oldest first, and
-        how many this reader has missed before them. None at first, as soon as it watches. Ends when closed.
+        """Yield the events of a scene that any server of this store publishes from now on.
+
+        The first item has no events and confirms that the watch has begun. Each further item has events,
+        oldest first, and the number of events that this reader missed before them.
 
         Raises:
-            StoreError: the store cannot be reached any more.
+            StoreError: the store is unavailable.
         """
 
     @abstractmethod
     async def close(self) -> None:
-        """Frees what is held."""
+        """Release all resources."""

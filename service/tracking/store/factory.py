@@ -1,4 +1,4 @@
-"""The track memory that the settings ask for."""
+"""Factory of the store that the settings name."""
 
 from service.redis_url import parse_address
 from service.settings import Settings
@@ -6,16 +6,16 @@ from service.tracking.store.base import TrackStore
 from service.tracking.store.memory import MemoryStore
 
 MAX_WATCHERS = 64
-"""Of one server; with Redis each has a connection of its own."""
+"""Watchers per server; with Redis, each holds a connection."""
 _WATCH_TIMEOUT = 10.0
-"""s; a watcher's reads wait in Redis for events, 2 s at most."""
+"""Seconds; a watcher's reads block in Redis for 2 s at most."""
 
 
 def make_store(settings: Settings) -> TrackStore:
-    """The store; nothing is connected yet."""
+    """Return the store; it connects at its first call."""
     if settings.store == "memory":
         return MemoryStore(settings.track_expiry, settings.max_tracked_agents)
-    # Not loaded where it is not used
+    # Imported only where it is used
     from service.tracking.store.redis.connection import connect  # noqa: PLC0415
     from service.tracking.store.redis.store import RedisStore  # noqa: PLC0415
 
@@ -23,5 +23,5 @@ def make_store(settings: Settings) -> TrackStore:
     client = connect(
         address, timeout_s=settings.store_timeout_ms / 1000, connections=settings.store_connections
     )
-    watching = connect(address, timeout_s=_WATCH_TIMEOUT, connections=MAX_WATCHERS)
-    return RedisStore(client, watching, settings.track_expiry, settings.max_tracked_agents)
+    watch_client = connect(address, timeout_s=_WATCH_TIMEOUT, connections=MAX_WATCHERS)
+    return RedisStore(client, watch_client, settings.track_expiry, settings.max_tracked_agents)

@@ -1,4 +1,4 @@
-"""Why a call of the track memory failed, in a word for the counts and in a sentence for the caller."""
+"""Failure reasons of the track memory: a label for metrics and a sentence for the caller."""
 
 from enum import StrEnum
 
@@ -6,9 +6,16 @@ from redis import exceptions as redis_errors
 
 from service.tracking.store.base import StoreError
 
+STORE_FAILURES: tuple[type[Exception], ...] = (
+    redis_errors.RedisError,
+    redis_errors.RedisClusterException,
+    OSError,
+)
+"""Errors of Redis or of the connection to it, timeouts included. Any other exception is a bug."""
 
-class Reason(StrEnum):
-    """A word; these and no others, as each makes a series of a metric."""
+
+class FailureReason(StrEnum):
+    """Reason of a failure. The set is closed, since each reason is a metric series."""
 
     TIMEOUT = "timeout"
     REFUSED = "refused"
@@ -19,49 +26,49 @@ class Reason(StrEnum):
     READONLY = "readonly"
     LOADING = "loading"
     DENIED = "denied"
-    """Wrong password, or the user may not do this."""
+    """The password is wrong, or the user lacks the permission."""
     CLUSTER_DOWN = "cluster_down"
     STOPPING = "stopping"
     OTHER = "other"
 
 
 _TEXTS = {
-    Reason.TIMEOUT: "the track memory did not answer in time",
-    Reason.REFUSED: "the track memory cannot be reached",
-    Reason.CIRCUIT_OPEN: "the track memory failed several times and is left alone for a moment",
-    Reason.SATURATED: "the track memory has too much to do",
-    Reason.OUT_OF_MEMORY: "the track memory is full",
-    Reason.READONLY: "the track memory cannot be written to",
-    Reason.LOADING: "the track memory is starting",
-    Reason.DENIED: "the track memory does not let the server in",
-    Reason.CLUSTER_DOWN: "a part of the track memory is down",
-    Reason.STOPPING: "the server is stopping",
-    Reason.OTHER: "the track memory failed",
+    FailureReason.TIMEOUT: "the track memory did not answer in time",
+    FailureReason.REFUSED: "the track memory cannot be reached",
+    FailureReason.CIRCUIT_OPEN: "the track memory failed repeatedly and is not called for a moment",
+    FailureReason.SATURATED: "the track memory is overloaded",
+    FailureReason.OUT_OF_MEMORY: "the track memory is full",
+    FailureReason.READONLY: "the track memory is read-only",
+    FailureReason.LOADING: "the track memory is starting",
+    FailureReason.DENIED: "the track memory denies access to the server",
+    FailureReason.CLUSTER_DOWN: "a part of the track memory is down",
+    FailureReason.STOPPING: "the server is stopping",
+    FailureReason.OTHER: "the track memory failed",
 }
 
-_KINDS: tuple[tuple[type[Exception], Reason], ...] = (
-    (TimeoutError, Reason.TIMEOUT),
-    (redis_errors.TimeoutError, Reason.TIMEOUT),
-    (redis_errors.MaxConnectionsError, Reason.SATURATED),
-    (redis_errors.BusyLoadingError, Reason.LOADING),
-    (redis_errors.AuthenticationError, Reason.DENIED),
-    (redis_errors.AuthorizationError, Reason.DENIED),
-    (redis_errors.NoPermissionError, Reason.DENIED),
-    (redis_errors.ConnectionError, Reason.REFUSED),
-    (OSError, Reason.REFUSED),
-    (redis_errors.OutOfMemoryError, Reason.OUT_OF_MEMORY),
-    (redis_errors.ReadOnlyError, Reason.READONLY),
-    (redis_errors.ClusterError, Reason.CLUSTER_DOWN),
-    (redis_errors.RedisClusterException, Reason.CLUSTER_DOWN),
+_REASONS: tuple[tuple[type[Exception], FailureReason], ...] = (
+    (TimeoutError, FailureReason.TIMEOUT),
+    (redis_errors.TimeoutError, FailureReason.TIMEOUT),
+    (redis_errors.MaxConnectionsError, FailureReason.SATURATED),
+    (redis_errors.BusyLoadingError, FailureReason.LOADING),
+    (redis_errors.AuthenticationError, FailureReason.DENIED),
+    (redis_errors.AuthorizationError, FailureReason.DENIED),
+    (redis_errors.NoPermissionError, FailureReason.DENIED),
+    (redis_errors.ConnectionError, FailureReason.REFUSED),
+    (OSError, FailureReason.REFUSED),
+    (redis_errors.OutOfMemoryError, FailureReason.OUT_OF_MEMORY),
+    (redis_errors.ReadOnlyError, FailureReason.READONLY),
+    (redis_errors.ClusterError, FailureReason.CLUSTER_DOWN),
+    (redis_errors.RedisClusterException, FailureReason.CLUSTER_DOWN),
 )
-"""The first that fits; an error that is a kind of another one stands before it."""
+"""The first match counts; subclasses stand before their base classes."""
 
 
-def reason_of(error: BaseException) -> Reason:
-    """Why a call failed, by the error that it ended with."""
-    return next((reason for kind, reason in _KINDS if isinstance(error, kind)), Reason.OTHER)
+def reason_of(error: BaseException) -> FailureReason:
+    """Return the reason of a failure from the exception."""
+    return next((reason for kind, reason in _REASONS if isinstance(error, kind)), FailureReason.OTHER)
 
 
-def store_error(reason: Reason) -> StoreError:
-    """What the caller is told; nothing of where Redis is."""
+def store_error(reason: FailureReason) -> StoreError:
+    """Return the error for the caller; it does not reveal the address of Redis."""
     return StoreError(_TEXTS[reason])

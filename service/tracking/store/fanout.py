@@ -1,11 +1,11 @@
-"""Events to those who watch a scene, within one process."""
+"""Delivery of events to the watchers of a scene within one process."""
 
 import asyncio
 from collections import deque
 from collections.abc import AsyncGenerator, Sequence
 
 BACKLOG = 1024
-"""Events that a reader may be behind."""
+"""Events that are kept for a slow reader."""
 
 
 class _Reader:
@@ -30,23 +30,23 @@ class _Reader:
 
 
 class Fanout:
-    """Hands events on; a reader that is slow loses the oldest and holds nobody up."""
+    """Delivers events to all readers; a slow reader loses the oldest ones and delays nobody."""
 
     def __init__(self) -> None:
         self._readers: dict[str, set[_Reader]] = {}
         self._closed = asyncio.Event()
 
     def watched(self, scene_id: str) -> bool:
-        """Whether anybody watches a scene."""
+        """Return whether a scene has a watcher."""
         return scene_id in self._readers
 
     def publish(self, scene_id: str, events: Sequence[bytes]) -> None:
-        """Gives events to all who watch the scene now."""
+        """Deliver events to the current watchers of a scene."""
         for reader in self._readers.get(scene_id, ()):
             reader.add(events)
 
     async def watch(self, scene_id: str) -> AsyncGenerator[tuple[Sequence[bytes], int], None]:
-        """Nothing at first, as soon as it watches; then events, and how many this reader lost before them."""
+        """Yield events, as ``TrackStore.watch`` does."""
         reader = _Reader()
         self._readers.setdefault(scene_id, set()).add(reader)
         try:
@@ -63,7 +63,7 @@ class Fanout:
                 del self._readers[scene_id]
 
     def close(self) -> None:
-        """Ends all that watch."""
+        """End all watches."""
         self._closed.set()
         for readers in self._readers.values():
             for reader in readers:

@@ -1,4 +1,4 @@
-"""What one model said of one agent."""
+"""Forecasts that one model made for one agent."""
 
 from bisect import bisect_left, bisect_right, insort
 from typing import NamedTuple
@@ -8,8 +8,8 @@ from model.scenes.scene import STEP_SECONDS
 from service.tracking.store.base import AGE_TOLERANCE, MAX_FORECASTS
 from service.tracking.store.records import AGES, BLOCK
 
-REACH = AGE_TOLERANCE + TIME_TOLERANCE
-"""s; so far off its lag a forecast may have been made."""
+MAX_OFFSET = AGE_TOLERANCE + TIME_TOLERANCE
+"""Seconds between the time of a forecast and its lag, at most."""
 
 _BLOCK_BYTES = BLOCK.itemsize
 _ABSENT = b"\xff" * (3 * _BLOCK_BYTES)
@@ -18,39 +18,43 @@ _NAN = float("nan")
 _LAGS = tuple(
     (STEP_SECONDS * age, (age - 1) * _BLOCK_BYTES, (age + 2) * _BLOCK_BYTES) for age in range(1, AGES + 1)
 )
-"""s before an instant, and where the steps around it lie in a forecast's bytes."""
+"""Seconds before an instant, and start and end of the steps around the instant in a forecast's bytes."""
 
 
-class Set(NamedTuple):
-    """The forecasts for an instant."""
+class ForecastSet(NamedTuple):
+    """Forecasts of all ages for one instant."""
 
     made_at: list[float]
-    """[A], s, by age; NaN where there is none."""
+    """[A], s, by age; NaN where there is no forecast."""
     blocks: list[bytes]
     """[A], the steps before, at and after the age."""
     complete: bool
-    """Whether there is one of each age."""
+    """Whether there is a forecast of each age."""
     exact: bool
-    """Whether those that there are were made on their lags."""
+    """Whether all forecasts were made exactly on their lags."""
 
 
-class Series:
-    """Forecasts by when they were made, and which sets were settled."""
+class ForecastHistory:
+    """Forecasts by time, and the instants whose sets have settled."""
 
     def __init__(self) -> None:
         self.times: list[float] = []
-        """s, ascending."""
+        """Times of the forecasts, s, ascending."""
         self.pending: list[float] = []
-        """Instants whose set is complete but not settled yet, ascending."""
+        """Instants whose set is complete but not settled, ascending."""
         self._settled: list[float] = []
-        # Nothing in here is looked through by the garbage collector: there may be a million of them
+        # Only floats and bytes, which the garbage collector does not traverse: there may be a million of them
         self._forecasts: dict[float, bytes] = {}
 
     def __len__(self) -> int:
         return len(self.times)
 
     def insert(self, made: float, forecast: bytes, steps: int) -> bool:
-        """Keeps a forecast, unless there is one of that time already; whether it did."""
+        """Store a forecast.
+
+        Returns:
+            False if there was already one of that time, which is kept.
+        """
         times = self.times
         at = bisect_right(times, made + TIME_TOLERANCE)
         if at > 0 and made - times[at - 1] <= TIME_TOLERANCE:
@@ -60,7 +64,7 @@ class Series:
         return True
 
     def trim(self, cut: float) -> None:
-        """Forgets what is older than a time, and the oldest where there is too much."""
+        """Drop forecasts older than a time, and the oldest beyond ``MAX_FORECASTS``."""
         times = self.times
         if not times or (times[0] >= cut and len(times) <= MAX_FORECASTS):
             return
@@ -72,28 +76,28 @@ class Series:
             del instants[: bisect_left(instants, cut)]
 
     def is_settled(self, instant: float) -> bool:
-        """Whether a set is final."""
+        """Return whether the set of an instant is final."""
         at = bisect_left(self._settled, instant)
         return at < len(self._settled) and self._settled[at] == instant
 
-    def wait(self, instant: float) -> None:
-        """Notes a complete set that is not settled yet."""
+    def mark_pending(self, instant: float) -> None:
+        """Record that the set of an instant is complete but may still change."""
         if instant not in self.pending:
             insort(self.pending, instant)
 
-    def settle(self, instant: float) -> None:
-        """Notes a set that is final."""
+    def mark_settled(self, instant: float) -> None:
+        """Record that the set of an instant is final."""
         insort(self._settled, instant)
         if instant in self.pending:
             self.pending.remove(instant)
 
     def may_be_complete(self, instant: float) -> bool:
-        """False where it is plain that an age is missing: most sets of a late call's instants."""
+        """Return False if an age is certainly missing; a cheap check for most instants of a late call."""
         times = self.times
-        return len(times) >= AGES and times[0] <= instant - _LAGS[-1][0] + REACH
+        return len(times) >= AGES and times[0] <= instant - _LAGS[-1][0] + MAX_OFFSET
 
-    def gather(self, instant: float) -> Set:
-        """The forecasts nearest to each lag of an instant."""
+    def collect(self, instant: float) -> ForecastSet:
+        """Return the forecasts nearest to each lag of an instant."""
         forecasts = self._forecasts
         made_at, blocks = [], []
         complete = exact = True
@@ -101,7 +105,7 @@ class Series:
             lag = instant - seconds
             made = lag if lag in forecasts else self._nearest(lag)
             block = b"" if made is None else forecasts[made][start:stop]
-            if made is None or len(block) < len(_ABSENT):  # none, or it does not go so far
+            if made is None or len(block) < len(_ABSENT):  # no forecast, or its horizon is too short
                 complete = False
                 made_at.append(_NAN)
                 blocks.append(_ABSENT)
@@ -109,17 +113,17 @@ class Series:
             exact = exact and -TIME_TOLERANCE <= made - lag <= TIME_TOLERANCE
             made_at.append(made)
             blocks.append(block)
-        return Set(made_at, blocks, complete, exact)
+        return ForecastSet(made_at, blocks, complete, exact)
 
     def _nearest(self, lag: float) -> float | None:
-        """When the forecast nearest to a time was made, the older of two; None: none is near enough."""
+        """Return the time of the forecast nearest to a lag, the older one of a tie; None: all are too far."""
         times = self.times
         after = bisect_right(times, lag)
-        best, off = None, REACH
-        if after > 0 and lag - times[after - 1] <= off:
-            best, off = times[after - 1], lag - times[after - 1]
+        best, offset = None, MAX_OFFSET
+        if after > 0 and lag - times[after - 1] <= offset:
+            best, offset = times[after - 1], lag - times[after - 1]
         if after < len(times):
             late = times[after] - lag
-            if late < off or (best is None and late <= off):
+            if late < offset or (best is None and late <= offset):
                 best = times[after]
         return best

@@ -1,4 +1,4 @@
-"""One call as an entry of a scene's log."""
+"""Entries of a scene's log, one per call."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,66 +6,73 @@ from typing import Any
 
 import msgpack
 
-from service.tracking.store.base import Sighting
-from service.tracking.store.records import AGES, FORECAST_BYTES, KINDS, OBSERVATION_BYTES
+from service.tracking.store.base import TrackUpdate
+from service.tracking.store.records import AGENT_TYPES, AGES, FORECAST_BYTES, OBSERVATION_BYTES
 
 _VERSION = 1
-"""Of this layout. Servers leave out what is of another one."""
-_KINDS = frozenset(KINDS.values())
+"""Version of this layout; servers skip entries of other versions."""
+_AGENT_TYPES = frozenset(AGENT_TYPES.values())
 
 
-class EntryError(ValueError):
-    """Bytes that are no entry."""
+class LogEntryError(ValueError):
+    """Bytes that are not a valid entry."""
 
 
 @dataclass(frozen=True)
-class Entry:
-    """What one call brought."""
+class LogEntry:
+    """Updates of one call."""
 
     time: float
     """s."""
-    sightings: Sequence[Sighting]
+    updates: Sequence[TrackUpdate]
 
 
-def pack_entry(entry: Entry) -> bytes:
-    """An entry in bytes."""
+def pack_log_entry(entry: LogEntry) -> bytes:
+    """Return the bytes of an entry."""
     rows = [
-        (one.agent_id, one.kind, one.observations, one.series, one.forecast, one.steps)
-        for one in entry.sightings
+        (
+            update.agent_id,
+            update.agent_type,
+            update.observations,
+            update.model,
+            update.forecast,
+            update.steps,
+        )
+        for update in entry.updates
     ]
     packed: bytes = msgpack.packb((_VERSION, entry.time, rows))
     return packed
 
 
-def unpack_entry(packed: bytes) -> Entry:
-    """An entry from its bytes.
+def unpack_log_entry(packed: bytes) -> LogEntry:
+    """Return the entry in some bytes.
 
     Raises:
-        EntryError: it is none, or of another layout.
+        LogEntryError: the bytes are not an entry, or have another layout.
     """
     try:
         version, time, rows = msgpack.unpackb(packed, use_list=False)
         if version != _VERSION or not isinstance(time, float):
-            raise EntryError("of another layout")
-        return Entry(time, [_sighting(*row) for row in rows])
+            raise LogEntryError("unknown layout")
+        return LogEntry(time, [_update(*row) for row in rows])
     except (ValueError, TypeError, msgpack.UnpackException) as error:
-        raise EntryError(f"no entry of a scene's log: {error}") from error
+        raise LogEntryError(f"not an entry of a scene's log: {error}") from error
 
 
-def _sighting(
-    agent_id: Any, kind: Any, observations: Any, series: Any, forecast: Any, steps: Any
-) -> Sighting:
-    fits = (
+def _update(
+    agent_id: Any, agent_type: Any, observations: Any, model: Any, forecast: Any, steps: Any
+) -> TrackUpdate:
+    valid = (
         isinstance(agent_id, str)
-        and kind in _KINDS
+        and agent_type in _AGENT_TYPES
         and isinstance(observations, bytes)
         and len(observations) % OBSERVATION_BYTES == 0
-        and isinstance(series, str)
+        and isinstance(model, str)
         and isinstance(forecast, bytes)
         and len(forecast) in (0, FORECAST_BYTES)
         and isinstance(steps, int)
         and 0 <= steps <= AGES
     )
-    if not fits:
-        raise EntryError("of another layout")
-    return Sighting(agent_id, kind, observations, series, forecast, steps)
+    if not valid:
+        raise LogEntryError("unknown layout")
+    return TrackUpdate(agent_id, agent_type, observations, model, forecast, steps)

@@ -1,7 +1,7 @@
-"""What is remembered, in bytes: the same in every store, and on the way there and back.
+"""Binary records of the track memory, the same in every store.
 
-All numbers are little-endian. A forecast is one block for now and one for each step of 0.5 s, so that what is
-needed of it for one instant, the steps around it, lies together.
+All numbers are little-endian. A forecast is one block for the current time and one for each step of 0.5 s, so
+that the steps around an instant are contiguous.
 """
 
 from typing import Any
@@ -14,20 +14,20 @@ from model.scenes.observations import Observations
 from model.scenes.scene import AgentType
 
 AGES = 12
-"""Ages at which forecasts are put beside each other: k · 0.5 s, k = 1 … 12."""
+"""Ages at which forecasts are compared: k · 0.5 s, k = 1 … 12."""
 MODES = 5
-"""Modes of a forecast that are remembered, the most likely ones."""
+"""Modes of a forecast that are stored, the most likely ones."""
 
 OBSERVATION_FIELDS = 9
 """time s; x, y m; heading rad; velocity m/s; acceleration m/s²; heading rate rad/s. NaN: not given."""
 OBSERVATION_BYTES = 8 * OBSERVATION_FIELDS
 
 FORECAST_BLOCKS = AGES + 2
-"""Of a forecast: now, each step, and one of NaN behind the last."""
+"""Blocks of a forecast: the current time, each step, and one of NaN after the last step."""
 
 BLOCK = np.dtype([("point", "<f8", (2,)), ("others", "<f4", (MODES - 1, 2))])
-"""One step: the most likely mode, m, ground frame, and the next likely ones relative to it, m; NaN where the
-forecast has no so many."""
+"""One step: the most likely mode, m, ground frame, and the next modes relative to it, m; NaN where the
+forecast has fewer modes."""
 
 FORECAST_BYTES = FORECAST_BLOCKS * BLOCK.itemsize
 
@@ -40,32 +40,32 @@ INSTANT = np.dtype(
         ("blocks", BLOCK, (AGES, 3)),
     ]
 )
-"""An observation with one model's forecasts for it: ``COMPLETE`` and so on, time s, where the agent was, m;
-by age when the forecast was made, s, and its steps before, at and after the age. NaN where there is none,
-and where it ends."""
+"""An observation with one model's forecasts for it: ``COMPLETE``, ``SETTLED`` and ``NEWLY``; time, s;
+position of the agent, m; and by age, the time of the forecast, s, and its steps before, at and after the age.
+NaN where there is no forecast, and after its end."""
 
 COMPLETE = 1
-"""There is a forecast of each age."""
+"""Flag: there is a forecast of each age."""
 SETTLED = 2
-"""The set is final."""
+"""Flag: the set is final."""
 NEWLY = 4
-"""It became so in this very call: now it counts."""
+"""Flag: the set became final in this call, and is aggregated now."""
 
-KINDS = {
+AGENT_TYPES = {
     AgentType.VEHICLE: b"v",
     AgentType.PEDESTRIAN: b"p",
     AgentType.CYCLIST: b"c",
     AgentType.UNKNOWN: b"u",
 }
-"""Agents' types, a byte each."""
+"""Bytes of the agent types."""
 
 
 def pack_observations(observations: Observations, newest_only: bool) -> list[bytes]:
-    """Each agent's observations, by ascending time.
+    """Return the observations of each agent, ascending by time.
 
     Args:
-        observations: of N agents.
-        newest_only: leave out all but the last one of each.
+        observations: observations of N agents.
+        newest_only: whether to return only the last observation of each agent.
 
     Returns:
         N times n · ``OBSERVATION_BYTES`` bytes.
@@ -89,10 +89,10 @@ def pack_observations(observations: Observations, newest_only: bool) -> list[byt
 
 
 def unpack_observations(packed: list[bytes]) -> Observations:
-    """Observations from their bytes.
+    """Return the observations in some bytes.
 
     Args:
-        packed: N times at least one observation.
+        packed: [N], at least one observation each.
     """
     counts: Ints = np.array([len(each) // OBSERVATION_BYTES for each in packed], dtype=np.int64)
     table = np.full((len(packed), int(counts.max()), OBSERVATION_FIELDS), np.nan)
@@ -113,12 +113,12 @@ def unpack_observations(packed: list[bytes]) -> Observations:
 
 
 def pack_forecasts(mixture: TrajectoryMixture) -> list[bytes]:
-    """Each agent's forecast: ``FORECAST_BLOCKS``; NaN behind its last step.
+    """Return the forecast of each agent: ``FORECAST_BLOCKS`` blocks, NaN after the last step.
 
     Args:
-        mixture: of N agents, at most ``AGES`` steps.
+        mixture: forecasts of N agents, at most ``AGES`` steps.
     """
-    # By numpy: a thread that calls torch gets helpers, which would be in the model's way
+    # In numpy: a thread that calls torch starts helper threads, which would slow the model down
     order = np.argsort(-mixture.log_weights.numpy(), axis=1, kind="stable")[:, :MODES]
     rows = np.arange(len(mixture))[:, None]
     means = mixture.means.numpy()[rows, order].astype(np.float64)  # [N, M, T, 2]
@@ -133,7 +133,7 @@ def pack_forecasts(mixture: TrajectoryMixture) -> list[bytes]:
 
 
 def unpack_instants(packed: bytes) -> "np.ndarray[Any, np.dtype[np.void]]":
-    """[P] of ``INSTANT``."""
+    """Return [P] of ``INSTANT``."""
     return np.frombuffer(packed, dtype=INSTANT)
 
 

@@ -1,7 +1,7 @@
-"""One scene's memory: a state that the calls of the scene change one after the other.
+"""Memory of one scene: a state machine that applies the calls of the scene in order.
 
-It depends on nothing but these calls and their order. So the memory in this process and the one in Redis,
-where the calls are written down in one order for all servers, are the same.
+The state depends only on the calls and their order. The memory in this process and the one in Redis, whose
+log orders the calls of all servers, are therefore equal.
 """
 
 import asyncio
@@ -9,84 +9,86 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from model.scenes.resample import TIME_TOLERANCE
-from service.tracking.store.base import LATENESS, WINDOW, Fate
-from service.tracking.store.log_entry import Entry
-from service.tracking.store.observation_buffer import Sighted
+from service.tracking.store.base import LATENESS, WINDOW, TrackStatus
+from service.tracking.store.log_entry import LogEntry
+from service.tracking.store.observation_buffer import ObservationBuffer
 from service.tracking.store.track import Instant, Track
 
 MAX_AGENTS = 4096
-"""Of a scene."""
+"""Agents per scene."""
 
 
 @dataclass
-class Outcome:
-    """What one call led to."""
+class ApplyResult:
+    """Result of one call."""
 
-    fates: list[Fate] = field(default_factory=list)
-    """Of each of its agents."""
+    track_statuses: list[TrackStatus] = field(default_factory=list)
+    """Status of each agent of the call."""
     histories: list[bytes] = field(default_factory=list)
-    """Of each of its agents, if they were asked for."""
+    """History of each agent of the call, if requested."""
     instants: list[Instant] = field(default_factory=list)
-    """What there is to be told."""
+    """Instants to report."""
     restarted: bool = False
-    """Whether all that came before was forgotten: its clock was ahead."""
+    """Whether the scene was cleared because its newest call was too far ahead of this one."""
 
 
 class SceneMemory:
-    """The agents of a scene, each as long as it was seen within the window of the scene's newest call."""
+    """Tracks of the agents that were observed within the window of the scene's newest call."""
 
     def __init__(self) -> None:
         self._newest = float("-inf")
         self._tracks: dict[str, Track] = {}
 
     def __len__(self) -> int:
-        """Agents."""
+        """Return the number of agents."""
         return len(self._tracks)
 
     @property
     def cut(self) -> float:
-        """s; of what was before it nothing is remembered."""
+        """Time before which everything is dropped, s."""
         return self._newest - WINDOW
 
-    def apply(self, entry: Entry, recall: float | None = None) -> Outcome:
-        """Remembers what a call brings.
+    def apply(self, entry: LogEntry, history_s: float | None = None) -> ApplyResult:
+        """Store the updates of a call.
 
         Args:
             entry: the call.
-            recall: s of history that are wanted; None: none is.
+            history_s: seconds of history to return; None: no histories.
         """
-        outcome = Outcome()
-        gone: Sequence[str] = ()
+        result = ApplyResult()
+        cleared: Sequence[str] = ()
         if entry.time < self._newest - LATENESS - TIME_TOLERANCE:
-            outcome.restarted = True
-            gone = tuple(self._tracks)
+            result.restarted = True
+            cleared = tuple(self._tracks)
             self._tracks.clear()
             self._newest = entry.time
         self._newest = max(self._newest, entry.time)
-        self._forget(self.cut)
-        for sighting in entry.sightings:
-            track = self._tracks.get(sighting.agent_id)
-            given = Sighted.parse(sighting.observations)
-            fate = Fate.RESET if sighting.agent_id in gone else Fate.NEW if track is None else Fate.KEPT
-            if track is not None and not track.fits(sighting.kind, given):
-                track, fate = None, Fate.RESET
+        self._drop_tracks_before(self.cut)
+        for update in entry.updates:
+            track = self._tracks.get(update.agent_id)
+            observations = ObservationBuffer.parse(update.observations)
+            status = TrackStatus.NEW if track is None else TrackStatus.KEPT
+            if update.agent_id in cleared:
+                status = TrackStatus.RESET
+            if track is not None and not track.fits(update.agent_type, observations):
+                track, status = None, TrackStatus.RESET
             if track is None:
-                track = self._tracks[sighting.agent_id] = Track(sighting.kind)
+                track = self._tracks[update.agent_id] = Track(update.agent_type)
                 self._make_room()
-            outcome.fates.append(fate)
-            outcome.instants.extend(track.exchange(sighting, given, entry.time, self.cut))
-            if recall is not None:
-                outcome.histories.append(track.history(entry.time, recall))
-        return outcome
+            result.track_statuses.append(status)
+            result.instants.extend(track.apply(update, observations, entry.time, self.cut))
+            if history_s is not None:
+                result.histories.append(track.history(entry.time, history_s))
+        return result
 
-    async def everything(self, window: float, agent_id: str | None = None) -> tuple[list[str], list[Instant]]:
-        """Ids of all agents, or of one if it is remembered, and each observation's set of every series.
+    async def snapshot(self, window: float, agent_id: str | None = None) -> tuple[list[str], list[Instant]]:
+        """Return the ids of the known agents, and the set of each of their observations for every model.
 
-        Each agent is as it is at one time; between them others get their turn, for there may be many.
+        Each agent's part is consistent. Other tasks run between agents, since there may be many.
 
         Args:
-            window: s before an agent's newest observation.
-            agent_id: which; None: all.
+            window: seconds before an agent's newest observation.
+            agent_id: the agent; None: all.
         """
         ids: list[str] = []
         instants: list[Instant] = []
@@ -94,16 +96,16 @@ class SceneMemory:
             track = self._tracks.get(one)
             if track is not None:
                 ids.append(one)
-                instants.extend(track.everything(one, window))
+                instants.extend(track.snapshot(one, window))
                 await asyncio.sleep(0)
         return ids, instants
 
-    def _forget(self, cut: float) -> None:
-        gone = [agent_id for agent_id, track in self._tracks.items() if track.newest < cut]
-        for agent_id in gone:
+    def _drop_tracks_before(self, cut: float) -> None:
+        dropped = [agent_id for agent_id, track in self._tracks.items() if track.newest < cut]
+        for agent_id in dropped:
             del self._tracks[agent_id]
 
     def _make_room(self) -> None:
-        """Who takes new ids for the same agents all the time must not fill the memory."""
+        """Drop the oldest track of a full scene: a client with ever new ids must not fill the memory."""
         if len(self._tracks) > MAX_AGENTS:
-            del self._tracks[next(iter(self._tracks))]  # the one that is known for the longest time
+            del self._tracks[next(iter(self._tracks))]

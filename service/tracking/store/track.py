@@ -1,4 +1,4 @@
-"""One agent's memory."""
+"""Memory of one agent."""
 
 import math
 import struct
@@ -7,146 +7,157 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from model.scenes.scene import STEP_SECONDS
-from service.tracking.store.base import MAX_SERIES, SETTLE_AFTER, Instants, Sighting
-from service.tracking.store.forecast_history import REACH, Series, Set
-from service.tracking.store.observation_buffer import Sighted
+from service.tracking.store.base import MAX_MODELS, SETTLE_AFTER, Instants, TrackUpdate
+from service.tracking.store.forecast_history import MAX_OFFSET, ForecastHistory, ForecastSet
+from service.tracking.store.observation_buffer import ObservationBuffer
 from service.tracking.store.records import AGES, COMPLETE, NEWLY, SETTLED
 
 _HEAD = struct.Struct(f"<Qddd{AGES}d")
 
 
 class Instant(NamedTuple):
-    """One observation's set of one series."""
+    """One observation with the forecasts of one model for it."""
 
     packed: bytes
-    """One of ``records.INSTANT``."""
+    """One record of ``records.INSTANT``."""
     agent_id: str
-    series: str
+    model: str
 
 
-def bundle(instants: Sequence[Instant]) -> Instants:
-    """Instants put together."""
+def join_instants(instants: Sequence[Instant]) -> Instants:
+    """Return instants as columns."""
     return Instants(
         b"".join([instant.packed for instant in instants]),
         [instant.agent_id for instant in instants],
-        [instant.series for instant in instants],
+        [instant.model for instant in instants],
     )
 
 
 class Track:
-    """One agent.
+    """Observations and forecasts of one agent.
 
     Args:
-        kind: of ``records.KINDS``.
+        agent_type: one of ``records.AGENT_TYPES``.
     """
 
-    def __init__(self, kind: bytes) -> None:
-        self._kind = kind
-        self._seen = Sighted()
-        self._series: dict[str, Series] = {}
+    def __init__(self, agent_type: bytes) -> None:
+        self._agent_type = agent_type
+        self._observations = ObservationBuffer()
+        self._forecasts: dict[str, ForecastHistory] = {}
+        """By model."""
 
     @property
     def newest(self) -> float:
-        """When it was last seen or forecast, s."""
-        newest = self._seen.times[-1] if len(self._seen) else -math.inf
-        for series in self._series.values():
-            if len(series):
-                newest = max(newest, series.times[-1])
+        """Time of the newest observation or forecast, s."""
+        newest = self._observations.times[-1] if len(self._observations) else -math.inf
+        for forecasts in self._forecasts.values():
+            if len(forecasts):
+                newest = max(newest, forecasts.times[-1])
         return newest
 
-    def fits(self, kind: bytes, given: Sighted) -> bool:
-        """Whether what a call brings can be of this agent.
+    def fits(self, agent_type: bytes, observations: ObservationBuffer) -> bool:
+        """Return whether the observations of a call can be of this agent.
 
         Args:
-            kind: of ``records.KINDS``.
-            given: the observations.
+            agent_type: one of ``records.AGENT_TYPES``.
+            observations: observations of the call.
         """
-        return kind == self._kind and self._seen.agrees(given)
+        return agent_type == self._agent_type and self._observations.agrees(observations)
 
-    def exchange(self, sighting: Sighting, given: Sighted, time: float, cut: float) -> list[Instant]:
-        """Remembers what a call brings, which fits.
+    def apply(
+        self, update: TrackUpdate, observations: ObservationBuffer, time: float, cut: float
+    ) -> list[Instant]:
+        """Store an update that fits.
 
         Args:
-            sighting: it.
-            given: its observations.
-            time: of the call, s.
-            cut: s; what is older is forgotten.
+            update: the update.
+            observations: its observations, parsed.
+            time: time of the call, s.
+            cut: time before which everything is dropped, s.
 
         Returns:
-            The newest observation of the call, if it names a series, and what else the call settled.
+            The newest observation of the call, if the update names a model, and all instants that it settled.
         """
-        given.trim(cut)
-        self._seen.insert(given)
-        mine = self._series.get(sighting.series)
-        if mine is None and sighting.forecast and len(self._series) < MAX_SERIES:
-            mine = self._series[sighting.series] = Series()
-        fresh = (
-            mine is not None
-            and bool(sighting.forecast)
-            and mine.insert(time, sighting.forecast, sighting.steps)
+        observations.trim(cut)
+        self._observations.insert(observations)
+        own = self._forecasts.get(update.model)
+        if own is None and update.forecast and len(self._forecasts) < MAX_MODELS:
+            own = self._forecasts[update.model] = ForecastHistory()
+        inserted = (
+            own is not None and bool(update.forecast) and own.insert(time, update.forecast, update.steps)
         )
-        told: list[Instant] = []
-        for when in given.times:
-            at = self._seen.last_until(when)
-            asked = when == given.times[-1]
-            for name, series in self._series.items():
-                self._look(told, sighting.agent_id, name, series, at, asked and name == sighting.series)
-            if asked and sighting.series and mine is None:
-                self._look(told, sighting.agent_id, sighting.series, Series(), at, True)
-        for name, series in self._series.items():
-            for instant in tuple(series.pending):
-                if self._seen.times[-1] - instant >= SETTLE_AFTER:
-                    self._look(told, sighting.agent_id, name, series, self._seen.last_until(instant), False)
-        if fresh and mine is not None:
-            for at in self._after(time):
-                self._look(told, sighting.agent_id, sighting.series, mine, at, False)
-        # Last: what is due must be settled by all that was there for it
-        self._seen.trim(cut)
-        for series in self._series.values():
-            series.trim(cut)
-        return told
+        reported: list[Instant] = []
+        for observed in observations.times:
+            at = self._observations.last_until(observed)
+            newest = observed == observations.times[-1]
+            for model, forecasts in self._forecasts.items():
+                requested = newest and model == update.model
+                self._settle(reported, update.agent_id, model, forecasts, at, requested)
+            if newest and update.model and own is None:
+                self._settle(reported, update.agent_id, update.model, ForecastHistory(), at, True)
+        for model, forecasts in self._forecasts.items():
+            for instant in tuple(forecasts.pending):
+                if self._observations.times[-1] - instant >= SETTLE_AFTER:
+                    at = self._observations.last_until(instant)
+                    self._settle(reported, update.agent_id, model, forecasts, at, False)
+        if inserted and own is not None:
+            for at in self._observations_ahead(time):
+                self._settle(reported, update.agent_id, update.model, own, at, False)
+        # Trim last: a set that is due must settle with all forecasts that were there for it
+        self._observations.trim(cut)
+        for forecasts in self._forecasts.values():
+            forecasts.trim(cut)
+        return reported
 
-    def history(self, time: float, recall: float) -> bytes:
-        """Observations up to a time, those of the last ``recall`` seconds, and always the last one."""
-        return self._seen.history(time, recall)
+    def history(self, time: float, history_s: float) -> bytes:
+        """Return the observations of the last ``history_s`` seconds before a time, at least the last one."""
+        return self._observations.history(time, history_s)
 
-    def everything(self, agent_id: str, window: float) -> Iterator[Instant]:
-        """Each observation's set of every series, as it is: those of the last ``window`` seconds."""
-        times = self._seen.times
+    def snapshot(self, agent_id: str, window: float) -> Iterator[Instant]:
+        """Yield the current set of each observation of the last ``window`` seconds, for every model."""
+        times = self._observations.times
         for at in range(bisect_left(times, times[-1] - window) if times else 0, len(times)):
             instant = times[at]
-            for name, series in self._series.items():
-                found = series.gather(instant)
-                flags = COMPLETE * found.complete + SETTLED * series.is_settled(instant)
-                yield self._instant(agent_id, name, at, found, flags)
+            for model, forecasts in self._forecasts.items():
+                found = forecasts.collect(instant)
+                flags = COMPLETE * found.complete + SETTLED * forecasts.is_settled(instant)
+                yield self._instant(agent_id, model, at, found, flags)
 
-    def _after(self, made: float) -> Iterator[int]:
-        """The observations that a forecast says something about, newest first."""
-        times = self._seen.times
+    def _observations_ahead(self, made: float) -> Iterator[int]:
+        """Yield the indices of the observations at a lag of a forecast, newest first."""
+        times = self._observations.times
         for at in range(len(times) - 1, -1, -1):
             ahead = times[at] - made
-            if ahead < STEP_SECONDS - REACH:
+            if ahead < STEP_SECONDS - MAX_OFFSET:
                 return
-            if abs(ahead - STEP_SECONDS * math.floor(ahead / STEP_SECONDS + 0.5)) <= REACH:
+            if abs(ahead - STEP_SECONDS * math.floor(ahead / STEP_SECONDS + 0.5)) <= MAX_OFFSET:
                 yield at
 
-    def _look(
-        self, told: list[Instant], agent_id: str, name: str, series: Series, at: int, asked: bool
+    def _settle(
+        self,
+        reported: list[Instant],
+        agent_id: str,
+        model: str,
+        forecasts: ForecastHistory,
+        at: int,
+        requested: bool,
     ) -> None:
-        """One observation's set: settles it if it can be; tells of it then, or if it is asked for."""
-        instant = self._seen.times[at]
-        settled = series.is_settled(instant)
-        if not asked and (settled or not series.may_be_complete(instant)):
+        """Settle the set of one observation if possible; report it if it settles or is requested."""
+        instant = self._observations.times[at]
+        settled = forecasts.is_settled(instant)
+        if not requested and (settled or not forecasts.may_be_complete(instant)):
             return
-        found = series.gather(instant)
+        found = forecasts.collect(instant)
         newly = False
         if found.complete and not settled:
-            newly = found.exact or self._seen.times[-1] - instant >= SETTLE_AFTER
-            (series.settle if newly else series.wait)(instant)
-        if asked or newly:
+            newly = found.exact or self._observations.times[-1] - instant >= SETTLE_AFTER
+            (forecasts.mark_settled if newly else forecasts.mark_pending)(instant)
+        if requested or newly:
             flags = COMPLETE * found.complete + SETTLED * (settled or newly) + NEWLY * newly
-            told.append(self._instant(agent_id, name, at, found, flags))
+            reported.append(self._instant(agent_id, model, at, found, flags))
 
-    def _instant(self, agent_id: str, name: str, at: int, found: Set, flags: int) -> Instant:
-        head = _HEAD.pack(flags, self._seen.times[at], *self._seen.place(at), *found.made_at)
-        return Instant(b"".join((head, *found.blocks)), agent_id, name)
+    def _instant(self, agent_id: str, model: str, at: int, found: ForecastSet, flags: int) -> Instant:
+        head = _HEAD.pack(
+            flags, self._observations.times[at], *self._observations.position(at), *found.made_at
+        )
+        return Instant(b"".join((head, *found.blocks)), agent_id, model)

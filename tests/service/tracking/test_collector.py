@@ -4,17 +4,17 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
-from service.tracking.aggregates import Sums
+from service.tracking.aggregates import Aggregates
 from service.tracking.collector import ConsistencyCollector, StoreMetrics
-from service.tracking.metrics import figures
+from service.tracking.metrics import instant_metrics
 from tests.service.tracking.test_metrics import instants
 
 
 def test_histograms_of_what_was_settled() -> None:
-    made, sums, registry = instants(100), Sums(), CollectorRegistry()
-    registry.register(ConsistencyCollector(lambda: sums))
+    made, sums, registry = instants(100), Aggregates(), CollectorRegistry()
+    registry.register(ConsistencyCollector(sums))
     assert b"_bucket" not in generate_latest(registry)
-    found = figures(made.tobytes())
+    found = instant_metrics(made.tobytes())
     sums.add(found, ["cab@1.0.0"] * 60 + ["cab@1.1.0"] * 40, newly_only=True)
     families = {f.name: f for f in text_string_to_metric_families(generate_latest(registry).decode())}
 

@@ -1,4 +1,4 @@
-"""Figures of sets against the metrics of ``model.metrics``."""
+"""InstantMetrics of sets against the metrics of ``model.metrics``."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from model.metrics.convergence import RANGES_M, convergence_s, errors_by_age_m
 from model.metrics.dispersion import dispersion
-from service.tracking.metrics import AGES_S, figures
+from service.tracking.metrics import AGES_S, instant_metrics
 from service.tracking.store.records import AGES, COMPLETE, INSTANT, MODES, NEWLY, SETTLED
 
 
@@ -26,7 +26,7 @@ def instants(count: int, seed: int = 0) -> np.ndarray:
 
 def test_on_their_lags_forecasts_are_taken_as_they_are() -> None:
     made = instants(50)
-    found = figures(made.tobytes())
+    found = instant_metrics(made.tobytes())
     points = made["blocks"]["point"][:, :, 1]
     errors_m = errors_by_age_m(points, made["position"])
     np.testing.assert_array_equal(found.errors_m, errors_m)
@@ -41,7 +41,7 @@ def test_on_their_lags_forecasts_are_taken_as_they_are() -> None:
 
 def test_the_nearest_of_the_likeliest_modes() -> None:
     made = instants(200)
-    found = figures(made.tobytes())
+    found = instant_metrics(made.tobytes())
     points = made["blocks"]["point"][:, :, 1]
     others = points[:, :, None] + made["blocks"]["others"][:, :, 1]
     apart = np.linalg.norm(others - made["position"][:, None, None], axis=-1).min(axis=-1)
@@ -52,7 +52,7 @@ def test_the_nearest_of_the_likeliest_modes() -> None:
 def test_the_only_mode_is_the_nearest() -> None:
     made = instants(3)
     made["blocks"]["others"] = np.nan
-    assert figures(made.tobytes()).nearest.all()
+    assert instant_metrics(made.tobytes()).nearest.all()
 
 
 def test_what_is_missing_is_no_number() -> None:
@@ -60,7 +60,7 @@ def test_what_is_missing_is_no_number() -> None:
     made["made_at"][0, 3] = np.nan
     made["blocks"][0, 3] = np.nan
     made["flags"][0] = 0
-    found = figures(made.tobytes())
+    found = instant_metrics(made.tobytes())
     assert np.isnan(found.errors_m[0]).tolist() == [age == 3 for age in range(AGES)]
     assert not found.nearest[0, 3]
     assert np.isnan(found.convergence_s[0]).all()
@@ -70,7 +70,7 @@ def test_what_is_missing_is_no_number() -> None:
 
 
 def test_no_instants() -> None:
-    assert len(figures(b"")) == 0
+    assert len(instant_metrics(b"")) == 0
 
 
 @given(st.floats(-0.09, 0.09), st.integers(0, 11))
@@ -85,7 +85,7 @@ def test_off_its_lag_a_forecast_is_read_at_the_instant(late: float, age: int) ->
         made["blocks"]["others"][0, age, block] = 2.0 + 0.5 * steps
     if age == AGES - 1:
         made["blocks"][0, age, 2] = np.nan
-    found = figures(made.tobytes())
+    found = instant_metrics(made.tobytes())
     # Within the tolerance of 0.1 ms it is not read between steps
     assert found.errors_m[0, age] == pytest.approx(0.0, abs=13 * 1e-4 + 1e-6)
     assert found.nearest[0, age]

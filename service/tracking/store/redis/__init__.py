@@ -1,1 +1,1 @@
-"""The track memory in Redis: single, Sentinel or Cluster."""
+"""Track memory in Redis: single server, Sentinel or Cluster."""

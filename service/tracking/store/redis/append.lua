@@ -1,13 +1,12 @@
--- Appends one call to a scene's log and answers what was appended since the caller looked last, in one step.
+-- Append one call to a scene's log and return what was appended since the caller's last read, in one step.
 --
--- The log is a hash: i, what names it; f and l, the numbers of its first and last entry; <n>, entry n; k<n>, its key.
--- Keys: the log; the sign that somebody watches. Arguments: the name of the log that the caller knows; the number of
--- the last entry that it knows (0: none) and that entry's key; the entry and its key (empty: append nothing); the number
--- of the first entry that is still needed, for all that the caller knows; ms that the log is kept; how many entries it
--- has at most.
+-- The log is a hash: i, its name; f and l, the numbers of its first and last entry; <n>, entry n; k<n>, its key.
+-- Keys: the log; the flag that the scene has a watcher. Arguments: the name of the log that the caller knows; the number
+-- of the last entry that it knows (0: none) and that entry's key; the entry and its key (empty: append nothing); the
+-- number of the first entry that the caller still needs; expiry of the log, ms; the maximum number of entries.
 --
--- Answers: the log's name; the number of the last entry before this one; whether what is answered goes on from what
--- the caller knows (0: it is all of the log); whether it is the log that the caller knows; whether somebody watches;
+-- Returns: the log's name; the number of the last entry before this one; whether the entries continue what the caller
+-- knows (0: they are the whole log); whether this is the log that the caller knows; whether the scene has a watcher; the
 -- entries.
 local name, known, key = ARGV[1], tonumber(ARGV[2]), ARGV[3]
 local entry, entry_key = ARGV[4], ARGV[5]
@@ -16,13 +15,12 @@ local needed, expiry, most = tonumber(ARGV[6]), ARGV[7], tonumber(ARGV[8])
 local got = redis.pcall('HMGET', KEYS[1], 'i', 'f', 'l', 'k' .. known)
 local own = not got.err and got[1]
 local first, last = tonumber(own and got[2] or nil), tonumber(own and got[3] or nil)
-if not first or not last or first < 1 or last < first or last - first > 2 * most then  -- none, or none of ours
-  -- Only if there is something: a script that has deleted is let past the limit of Redis' memory
+if not first or not last or first < 1 or last < first or last - first > 2 * most then  -- no log, or not one of ours
+  -- Only if the key exists: after a deletion, a script may exceed Redis' memory limit
   if got.err or redis.call('EXISTS', KEYS[1]) == 1 then redis.call('DEL', KEYS[1]) end
   own, first, last = entry_key, 1, 0
 end
--- An entry that the caller knows may have been dropped since; that another stands in its place is of a log that
--- lost its end
+-- The entry that the caller knows may have been dropped since. If another entry has its number, the log lost its end
 local same = own == name and known <= last and (known < first or got[4] == key)
 local continues = same and known >= first
 local from = continues and known + 1 or first
@@ -36,7 +34,7 @@ if entry ~= '' then
   local n = last + 1
   local keep = math.max(first, n - most + 1)
   if continues then keep = math.max(keep, math.min(needed, n)) end
-  -- This first: where Redis is full it fails, and then nothing has changed
+  -- First: this fails if Redis is full, and then nothing has changed
   redis.call('HSET', KEYS[1], 'i', own, 'f', keep, 'l', n, n, entry, 'k' .. n, entry_key)
   for number = first, keep - 1 do redis.call('HDEL', KEYS[1], number, 'k' .. number) end
   redis.call('PEXPIRE', KEYS[1], expiry)

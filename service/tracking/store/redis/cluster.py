@@ -1,4 +1,4 @@
-"""The client of a Redis Cluster: redis-py's, but it waits boundedly, follows redirections and recovers."""
+"""Redis Cluster client: redis-py's, with bounded waits, correct redirections and recovery."""
 
 import asyncio
 from collections.abc import Sequence
@@ -15,29 +15,29 @@ from redis.typing import EncodableT
 from service.redis_url import Endpoint
 
 _SPARE = 4
-"""Connections to a node beyond those of commands: for subscriptions."""
+"""Connections per node beyond those for commands, for subscriptions."""
 _REFRESH_TIMEOUTS = 2
-"""Nodes that hang in turn before a look at the topology is given up. Another one begins with other nodes."""
+"""Hanging nodes after which a topology refresh is abandoned; the next one begins with other nodes."""
 
 
 class Cluster(RedisCluster):
-    """A client that waits for a free connection, and only so long."""
+    """Cluster client that waits for a free connection, up to a timeout."""
 
     def __init__(
         self, endpoints: Sequence[Endpoint], *, connections: int, timeout_s: float, **options: Any
     ) -> None:
         """
         Args:
-            endpoints: nodes to begin with.
-            connections: commands at a time.
-            timeout_s: s that a command waits until there are fewer; and that a node is waited for.
-            options: of ``RedisCluster``.
+            endpoints: initial nodes.
+            connections: concurrent commands, at most.
+            timeout_s: seconds that a command waits for its turn, and that a node may take.
+            options: options of ``RedisCluster``.
         """
         super().__init__(
             startup_nodes=[ClusterNode(each.host, each.port) for each in endpoints],
             max_connections=connections + _SPARE,
-            retry=Retry(NoBackoff(), 0),  # of whole commands; redirections are followed anyway
-            reinitialize_steps=0,  # otherwise each fifth redirection closes all connections, used or not
+            retry=Retry(NoBackoff(), 0),  # retries of whole commands; redirections are still followed
+            reinitialize_steps=0,  # else each fifth redirection closes all connections, also those in use
             **options,
         )
         self.commands_parser = _CommandsIfNeeded()
@@ -47,11 +47,11 @@ class Cluster(RedisCluster):
         self._refresh: asyncio.Task[RedisCluster] | None = None
 
     async def execute_command(self, *args: EncodableT, **kwargs: Any) -> Any:
-        """As redis-py's, but it waits where that one would fail: for a connection.
+        """Execute a command as redis-py does, but wait for a free connection instead of failing.
 
         Raises:
-            MaxConnectionsError: there was none in time.
-            RedisConnectionError: it was lost.
+            MaxConnectionsError: no connection became free in time.
+            RedisConnectionError: the connection was lost.
         """
         try:
             async with asyncio.timeout(self._timeout_s):
@@ -59,10 +59,10 @@ class Cluster(RedisCluster):
         except TimeoutError:
             raise MaxConnectionsError("no connection became free") from None
         try:
-            if not self.get_default_node():  # redis-py would begin with any node, and be sent on
+            if not self.get_default_node():  # redis-py would start at any node and be redirected
                 await self.initialize()
             return await super().execute_command(*args, **kwargs)
-        except AttributeError as error:  # there is no writer: a call that failed has closed all connections
+        except AttributeError as error:  # no writer: a failed call has closed all connections
             raise RedisConnectionError("the connection was closed") from error
         finally:
             self._places.release()
@@ -72,21 +72,22 @@ class Cluster(RedisCluster):
         additional_startup_nodes_info: list[tuple[str, int]] | None = None,
         last_failed_node_name: str | None = None,
     ) -> RedisCluster:
-        """Looks at the topology, if that is due.
+        """Refresh the topology if necessary.
 
-        Whoever comes meanwhile shares the result: in redis-py each waits for the one before it to have failed
-        and then tries by itself.
+        Concurrent callers share one refresh. In redis-py each waits until the previous one has failed, then
+        tries again itself.
         """
         if self._refresh is None:
             self._refresh = asyncio.create_task(
-                self._look(additional_startup_nodes_info, last_failed_node_name), name="cluster topology"
+                self._refresh_topology(additional_startup_nodes_info, last_failed_node_name),
+                name="cluster topology",
             )
-            self._refresh.add_done_callback(self._looked)
+            self._refresh.add_done_callback(self._on_refreshed)
         return await asyncio.shield(self._refresh)
 
     async def aclose(self) -> None:
-        """Closes all connections. redis-py's leaves them open while a look at the topology is due."""
-        if self._refresh is not None:  # or it would open some more
+        """Close all connections; redis-py leaves them open while a topology refresh is due."""
+        if self._refresh is not None:  # it would open new connections
             await asyncio.wait((self._refresh,))
         await super().aclose()
         await self.nodes_manager.aclose()
@@ -95,34 +96,36 @@ class Cluster(RedisCluster):
     def get_node(
         self, host: str | None = None, port: int | None = None, node_name: str | None = None
     ) -> ClusterNode | None:
-        """The node, None if it is not known. By name redis-py asks for the one that a slot is moving to."""
+        """Return a node; None: it is unknown. Calls by name ask for the node that a slot is moving to."""
         node = super().get_node(host, port, node_name)
         return _Target(node) if node is not None and node_name else node
 
-    async def _look(self, more: list[tuple[str, int]] | None, last_failed: str | None) -> RedisCluster:
+    async def _refresh_topology(
+        self, more: list[tuple[str, int]] | None, last_failed: str | None
+    ) -> RedisCluster:
         try:
             async with asyncio.timeout(_REFRESH_TIMEOUTS * self._timeout_s):
                 return await super().initialize(more, last_failed)
         except Exception:
-            # By now redis-py knows only the addresses that the cluster itself had told. All of them may have
-            # changed, so the ones that we were given are asked, too.
+            # redis-py now knows only the addresses that the cluster announced. All of them may have changed,
+            # so the configured ones are added again.
             known = self.nodes_manager.startup_nodes
             for each in self._endpoints:
                 node = ClusterNode(each.host, each.port, **self.nodes_manager.connection_kwargs)
                 known.setdefault(node.name, node)
             raise
 
-    def _looked(self, refresh: "asyncio.Task[RedisCluster]") -> None:
+    def _on_refreshed(self, refresh: "asyncio.Task[RedisCluster]") -> None:
         self._refresh = None
         if not refresh.cancelled():
-            refresh.exception()  # looked at, or asyncio would complain where nobody waits for it any more
+            refresh.exception()  # else asyncio logs an exception that nobody retrieves
 
 
 class _Target(ClusterNode):
-    """A node that a slot is moving to, for one command that was sent on to it.
+    """Node that a slot is moving to, for one redirected command.
 
-    The node obeys if ASKING came just before on the same connection. redis-py sends it on whichever is free,
-    and so the command on another one if there are several.
+    The node accepts the command only after ASKING on the same connection. redis-py sends the two on any free
+    connections, which may differ.
     """
 
     def __init__(self, node: ClusterNode) -> None:
@@ -152,10 +155,10 @@ class _Target(ClusterNode):
 
 
 class _CommandsIfNeeded(AsyncCommandsParser):
-    """What the cluster says of its commands, if one is called of which redis-py knows nothing.
+    """Command table of the cluster, loaded only for a command that redis-py does not know.
 
-    redis-py asks for all of them at each look at the topology and then parses for 40 ms, in which the event
-    loop does nothing else. For EVALSHA and its like it needs none of it.
+    redis-py loads the table at each topology refresh, and parsing it blocks the event loop for 40 ms. EVALSHA
+    and the other commands used here do not need it.
     """
 
     def __init__(self) -> None:

@@ -1,9 +1,9 @@
-"""Clients of Redis, whichever layout it has.
+"""Redis clients for all layouts: single server, Sentinel, Cluster.
 
-They are redis-py's, set up to fail soon, for whoever calls them would rather do without an answer than wait.
-A command is sent once, with no retries, and each thing that it waits for, a free connection, a new one, the
-reply, takes at most the timeout. A call that is given up in the middle, by a timeout or a cancellation, costs
-the connection: redis-py closes it, so that nobody else gets the reply.
+The clients are redis-py's, configured to fail fast, because callers prefer no result to a late one. A command
+is sent once, without retries. Each step (waiting for a free connection, connecting, waiting for the reply)
+takes at most the timeout. A timeout or a cancellation in the middle of a call costs the connection: redis-py
+closes it, so that no other call gets the reply.
 """
 
 import ssl
@@ -18,30 +18,30 @@ from service.redis_url import Layout, RedisAddress
 from service.tracking.store.redis.cluster import Cluster
 
 CLIENT_NAME = "cab-forecast"
-"""What CLIENT LIST on the server calls us."""
+"""Client name in CLIENT LIST."""
 _HEALTH_CHECK = 15
-"""s of silence after which a connection is tried with a PING before it is used."""
+"""Seconds of idleness after which a connection is checked with a PING before use."""
 
 
 def connect(address: RedisAddress, *, timeout_s: float, connections: int) -> Redis | Cluster:
-    """A client. It connects when it is first used, and again when a connection was lost.
+    """Return a client, which connects at its first command and reconnects when a connection is lost.
 
     Args:
-        address: of the server, the Sentinels or the cluster.
-        timeout_s: s for each thing that a command waits for; more than a command that blocks does so.
-        connections: to the server at most; commands that find none free wait for one. Of a cluster: commands
-            at a time, and to each node at most a few connections more.
+        address: address of the server, the Sentinels or the cluster.
+        timeout_s: seconds for each step of a command; must exceed the time for which a command blocks.
+        connections: connections to the server, at most; commands wait for a free one. In a cluster:
+            concurrent commands, and for each node at most a few connections more.
 
     Returns:
-        The client; replies are bytes. Whoever asked for it closes it, with ``aclose``.
+        The client; replies are bytes. The caller closes it with ``aclose``.
 
     Raises:
-        OSError: there are no certificates in the file of the authorities, or there is no such file.
+        OSError: the CA file does not exist or has no certificates.
     """
     if address.ca_file is not None:
-        ssl.create_default_context(cafile=address.ca_file)  # better now than at each connection
-    # In RESP3 a server may send what nobody asked for, and then redis-py no longer checks that a connection
-    # is clean before it is used. Nothing here needs it.
+        ssl.create_default_context(cafile=address.ca_file)  # fail now, not at each connection
+    # RESP3 allows push messages, with which redis-py no longer checks that a connection is clean before use.
+    # Nothing here needs it.
     common: dict[str, Any] = {
         "protocol": 2,
         "socket_timeout": timeout_s,
@@ -51,7 +51,7 @@ def connect(address: RedisAddress, *, timeout_s: float, connections: int) -> Red
         "client_name": CLIENT_NAME,
         "driver_info": None,
     }
-    if address.tls:  # certificates and the names in them are checked
+    if address.tls:  # certificates and host names are verified
         common |= {"ssl": True, "ssl_ca_certs": address.ca_file}
     user: dict[str, Any] = {"username": address.user, "password": address.password}
     if address.layout is Layout.CLUSTER:
@@ -64,10 +64,10 @@ def connect(address: RedisAddress, *, timeout_s: float, connections: int) -> Red
     }
     if address.layout is Layout.SENTINEL:
         credentials = {"username": address.sentinel_user, "password": address.sentinel_password}
-        watchers = Sentinel(  # type: ignore[no-untyped-call]
+        sentinels = Sentinel(  # type: ignore[no-untyped-call]
             [(each.host, each.port) for each in address.endpoints], sentinel_kwargs=common | credentials
         )
-        client: Redis = watchers.master_for(
+        client: Redis = sentinels.master_for(
             address.master_name, connection_pool_class=_SentinelPool, **common, **user, **pool
         )
         return client
@@ -80,9 +80,9 @@ def connect(address: RedisAddress, *, timeout_s: float, connections: int) -> Red
 
 
 class _SentinelPool(SentinelConnectionPool, BlockingConnectionPool):
-    """Connections to the master. It waits while all are in use, which redis-py's own does not."""
+    """Connections to the master; waits while all are in use, unlike redis-py's pool."""
 
     async def aclose(self) -> None:
-        """Closes the connections to the Sentinels as well: nobody else has them."""
+        """Close the connections to the master and to the Sentinels, which only this pool uses."""
         await super().aclose()
         await self.sentinel_manager.aclose()

@@ -1,5 +1,7 @@
--- Keys: the stream of a scene's events, and how many there were. Arguments: ms that both are kept, how many entries
--- the stream keeps at least, how many events come, and these in one string.
+-- Publish events of a scene and return the number of events published so far.
+--
+-- Keys: the stream of the scene's events; the number of events so far. Arguments: expiry of both, ms; the minimum number
+-- of entries that the stream keeps; the number of new events; the new events in one string.
 local function publish()
   local last = redis.pcall('INCRBY', KEYS[2], ARGV[3])
   if type(last) == 'table' then return last end
@@ -8,7 +10,7 @@ local function publish()
 end
 
 local last = publish()
-if type(last) == 'table' and not string.find(last.err, 'OOM') then  -- something else in their place
+if type(last) == 'table' and not string.find(last.err, 'OOM') then  -- the keys hold something else
   redis.call('DEL', KEYS[1], KEYS[2])
   last = publish()
 end

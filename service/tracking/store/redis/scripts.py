@@ -1,18 +1,54 @@
-"""Lua scripts that run in Redis, each loaded once and again when Redis has forgotten it."""
+"""Keys of a scene in Redis and the Lua scripts that use them."""
 
 import hashlib
 from collections.abc import Sequence
 from importlib import resources
 from typing import Any
+from urllib.parse import quote
 
 from redis.exceptions import NoScriptError
 
+_PREFIX = "cab:1"
+"""Number of this layout; another layout gets another number."""
+
+
+class SceneKeys:
+    """Keys of one scene.
+
+    The part in braces selects the slot in a Redis Cluster: all keys of a scene are in one slot, so that one
+    script can use them.
+    """
+
+    def __init__(self, scene_id: str) -> None:
+        # A quoted id has no brace, which would end the part in braces, and no colon
+        self._scene = f"{_PREFIX}:{{{quote(scene_id, safe='')}}}"
+
+    @property
+    def log(self) -> str:
+        """Hash of the calls of the last seconds."""
+        return f"{self._scene}:log"
+
+    @property
+    def watched(self) -> str:
+        """Flag that exists while the scene has a watcher."""
+        return f"{self._scene}:watched"
+
+    @property
+    def events(self) -> str:
+        """Stream of the events for watchers."""
+        return f"{self._scene}:events"
+
+    @property
+    def published(self) -> str:
+        """Number of events published so far."""
+        return f"{self._scene}:published"
+
 
 class Script:
-    """One script of this package.
+    """Lua script of this package; it is loaded again if Redis has forgotten it.
 
     Args:
-        name: of its file.
+        name: file name.
     """
 
     def __init__(self, name: str) -> None:
@@ -20,15 +56,15 @@ class Script:
         self._digest = hashlib.sha1(self._text.encode(), usedforsecurity=False).hexdigest()
 
     async def run(self, client: Any, keys: Sequence[str], arguments: Sequence[str | bytes | int]) -> Any:
-        """Runs it: one round trip, two where Redis did not know it.
+        """Run the script: one round trip, or two if Redis did not know it.
 
         Args:
-            client: of redis.asyncio, of one server or of a cluster.
-            keys: all in one slot.
-            arguments: whatever the script takes.
+            client: client of redis.asyncio, for one server or a cluster.
+            keys: keys, all in one slot.
+            arguments: arguments of the script.
 
         Raises:
-            redis.exceptions.RedisError, OSError: there is no answer.
+            redis.exceptions.RedisError, OSError: Redis failed or cannot be reached.
         """
         try:
             return await client.evalsha(self._digest, len(keys), *keys, *arguments)

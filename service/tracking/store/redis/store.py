@@ -1,9 +1,9 @@
-"""The track memory in Redis 7: shared by all servers that use it.
+"""Track memory in Redis 7, shared by all servers that use it.
 
-Redis holds, for each scene, a log of the calls of the last seconds. A call appends itself and gets, in the
-same round trip, what other servers appended since this one looked last. From these each server has the
-scene's memory at hand: nothing but the log and its order goes into it, so that all servers have the same,
-and one that starts reads the log once.
+Redis holds, for each scene, a log of the calls of the last seconds. Each call appends itself and, in the same
+round trip, reads what other servers appended since this server's last read. From the log each server builds
+the scene's memory in its own process. The memory depends only on the log and its order, so it is the same on
+all servers, and a server that starts reads the log once.
 """
 
 import asyncio
@@ -19,24 +19,23 @@ import structlog
 from redis.asyncio import Redis
 from redis.exceptions import ReadOnlyError
 
-from service.tracking.store.base import Event, Recalled, Remembered, Sighting, TrackStore
-from service.tracking.store.failures import reason_of, store_error
-from service.tracking.store.log_entry import Entry, EntryError, pack_entry, unpack_entry
-from service.tracking.store.redis.keys import SceneKeys
-from service.tracking.store.redis.scripts import Script
-from service.tracking.store.scene import Outcome, SceneMemory
-from service.tracking.store.track import Instant, bundle
+from service.tracking.store.base import ExchangeResult, SceneSnapshot, SceneStatus, TrackStore, TrackUpdate
+from service.tracking.store.failures import STORE_FAILURES, reason_of, store_error
+from service.tracking.store.log_entry import LogEntry, LogEntryError, pack_log_entry, unpack_log_entry
+from service.tracking.store.redis.scripts import SceneKeys, Script
+from service.tracking.store.scene import ApplyResult, SceneMemory
+from service.tracking.store.track import Instant, join_instants
 
 _log = structlog.get_logger(__name__)
 
 MAX_ENTRIES = 2048
-"""Of a scene's log; beyond it the oldest go, whatever their time."""
+"""Entries of a scene's log; beyond it the oldest are dropped, whatever their time."""
 _KEY_BYTES = 8
 _LENGTH = struct.Struct("<I")
 _STREAM_ENTRIES = 256
 _BLOCK_MS = 2000
 _WATCHED_MS = 10_000
-"""How long a watcher's sign stands without being renewed."""
+"""Milliseconds after which a watcher's flag expires unless it is renewed."""
 
 
 class _Scene:
@@ -45,117 +44,117 @@ class _Scene:
     def __init__(self) -> None:
         self.memory = SceneMemory()
         self.log = b""
-        """The log's name; empty: none was read."""
+        """Name of the log; empty: none has been read."""
         self.last, self.key = 0, b""
         """Number and key of the last entry that was read."""
         self.lock = asyncio.Lock()
-        """One call at a time: what one reads, the next need not."""
+        """Lock of the calls of this scene: what one reads, the next need not."""
         self.users = 0
-        """Calls that have it or wait for it."""
+        """Calls that hold or await the lock."""
         self.used = 0.0
-        """When, on the clock, s."""
+        """Time of the last use on the clock, s."""
         self.agents = 0
-        """That it had when it was last looked at."""
+        """Number of agents after the last use."""
         self.lost = False
-        """Whether the log that was known has gone, and no call was told so yet."""
-        self.missed: list[Instant] = []
-        """What entries of this server led to of which it had got no answer; no call was told of it yet."""
+        """Whether the known log is gone and no call has reported it yet."""
+        self.unreported: list[Instant] = []
+        """Instants from this server's own entries whose replies were lost, until a call reports them."""
         self._times: deque[tuple[int, float]] = deque()
         """Number and time of each entry, in order."""
 
     @property
     def needed(self) -> int:
-        """Number of the first entry that is still remembered."""
+        """Number of the first entry that the memory still needs."""
         while self._times and self._times[0][1] < self.memory.cut:
             self._times.popleft()
         return self._times[0][0] if self._times else self.last + 1
 
-    def apply(self, number: int, key: bytes, entry: Entry, recall: float | None = None) -> Outcome:
-        """Goes one entry on."""
-        outcome = self.memory.apply(entry, recall)
-        if outcome.restarted:  # its clock was ahead: by its time nothing of before would ever be old
+    def apply(self, number: int, key: bytes, entry: LogEntry, history_s: float | None = None) -> ApplyResult:
+        """Apply the next entry."""
+        result = self.memory.apply(entry, history_s)
+        if result.restarted:  # the clock was set back: by it, the earlier entries would never become old
             self._times.clear()
         self._times.append((number, entry.time))
         self.skip(number, key)
-        return outcome
+        return result
 
     def skip(self, number: int, key: bytes) -> None:
-        """Goes one entry on that says nothing."""
+        """Pass over the next entry."""
         self.last, self.key = number, key
 
-    def forget(self) -> None:
-        """Begins anew."""
+    def clear(self) -> None:
+        """Discard everything that was read."""
         self.memory = SceneMemory()
         self._times.clear()
         self.log, self.last, self.key = b"", 0, b""
 
 
 class RedisStore(TrackStore):
-    """Remembers in one server, behind Sentinels or in a cluster.
+    """Store in a single Redis server, behind Sentinels, or in a cluster.
 
     Args:
-        client: of ``connection.connect``, for calls.
-        watching: another one, for those who watch: each holds a connection for as long as it does.
-        expiry: s without a call after which a scene is forgotten.
-        max_agents: of all scenes that this server has at hand; beyond it those not used for the longest time
-            are read again when they are.
-        now: the clock, s.
+        client: client from ``connection.connect``, for calls.
+        watch_client: client for watchers, each of which holds a connection.
+        expiry: seconds without a call after which a scene is deleted.
+        max_agents: agents of all scenes in this process, at most; beyond it the least recently used scenes
+            are dropped here and read again at their next call.
+        now: clock, s.
     """
 
     def __init__(
         self,
         client: Any,
-        watching: Any,
+        watch_client: Any,
         expiry: float,
         max_agents: int,
         now: Callable[[], float] = clock.monotonic,
     ) -> None:
         self._client = client
-        self._watching = watching
+        self._watch_client = watch_client
         self._expiry_ms = round(expiry * 1000)
         self._max_agents = max_agents
         self._now = now
         self._scenes: OrderedDict[str, _Scene] = OrderedDict()
-        """The longest unused first."""
+        """Least recently used first."""
         self._agents = 0
-        """Of all these scenes."""
+        """Number of agents of all these scenes."""
         self._unanswered: OrderedDict[bytes, None] = OrderedDict()
-        """Keys of this server's entries of which it is not known whether they were appended."""
+        """Keys of this server's entries that may or may not have been appended."""
         self._append = Script("append.lua")
         self._publish = Script("publish.lua")
 
     async def exchange(
-        self, scene_id: str, time: float, sightings: Sequence[Sighting], recall: float | None = None
-    ) -> Recalled:
-        entry = Entry(time, sightings)
+        self, scene_id: str, time: float, updates: Sequence[TrackUpdate], history_s: float | None = None
+    ) -> ExchangeResult:
+        entry = LogEntry(time, updates)
         key = secrets.token_bytes(_KEY_BYTES)
-        async with self._at_hand(scene_id) as scene:
+        async with self._locked(scene_id) as scene:
             self._unanswered[key] = None
             if len(self._unanswered) > MAX_ENTRIES:
                 self._unanswered.popitem(last=False)
-            watched = await self._call(scene_id, scene, key + pack_entry(entry), key)
+            watched = await self._call(scene_id, scene, key + pack_log_entry(entry), key)
             del self._unanswered[key]
-            begun = scene.last == 0
-            outcome = scene.apply(scene.last + 1, key, entry, recall)
-            event = Event.LOST if scene.lost else Event.BEGUN if begun else Event.KEPT
-            instants = bundle([*scene.missed, *outcome.instants])
-            scene.lost, scene.missed = False, []
-        return Recalled(event, outcome.fates, outcome.histories, instants, watched)
+            is_new = scene.last == 0
+            result = scene.apply(scene.last + 1, key, entry, history_s)
+            status = SceneStatus.LOST if scene.lost else SceneStatus.NEW if is_new else SceneStatus.KEPT
+            instants = join_instants([*scene.unreported, *result.instants])
+            scene.lost, scene.unreported = False, []
+        return ExchangeResult(status, result.track_statuses, result.histories, instants, watched)
 
-    async def read(self, scene_id: str, window: float, agent_id: str | None = None) -> Remembered:
-        async with self._at_hand(scene_id) as scene:
+    async def read(self, scene_id: str, window: float, agent_id: str | None = None) -> SceneSnapshot:
+        async with self._locked(scene_id) as scene:
             await self._call(scene_id, scene)
             memory = scene.memory
-        # Calls of the scene need not wait for this
-        ids, instants = await memory.everything(window, agent_id)
-        return Remembered(ids, bundle(instants))
+        # Without the lock: other calls of the scene need not wait for this
+        ids, instants = await memory.snapshot(window, agent_id)
+        return SceneSnapshot(ids, join_instants(instants))
 
     async def reset(self, scene_id: str) -> int:
-        async with self._at_hand(scene_id) as scene:
+        async with self._locked(scene_id) as scene:
             await self._call(scene_id, scene)
             agents = len(scene.memory)
             await self._client.delete(SceneKeys(scene_id).log)
-            scene.forget()
+            scene.clear()
             return agents
 
     async def publish(self, scene_id: str, events: Sequence[bytes]) -> None:
@@ -169,50 +168,52 @@ class RedisStore(TrackStore):
 
     async def watch(self, scene_id: str) -> AsyncGenerator[tuple[Sequence[bytes], int], None]:
         keys = SceneKeys(scene_id)
-        renewing: asyncio.Task[None] | None = None
+        renewal: asyncio.Task[None] | None = None
         try:
             entry_id, seen = b"0-0", 0
-            for newest, fields in await self._watching.xrevrange(keys.events, count=1):
+            for newest, fields in await self._watch_client.xrevrange(keys.events, count=1):
                 entry_id, seen = newest, int(fields[b"last"])
-            await self._watching.set(keys.watched, 1, px=_WATCHED_MS)
-            renewing = asyncio.create_task(self._renew(keys))  # however slowly the events are taken
+            await self._watch_client.set(keys.watched, 1, px=_WATCHED_MS)
+            renewal = asyncio.create_task(self._renew(keys))  # independent of how fast events are consumed
             yield (), 0
             while True:
-                streams = await self._watching.xread({keys.events: entry_id}, block=_BLOCK_MS)
+                streams = await self._watch_client.xread({keys.events: entry_id}, block=_BLOCK_MS)
+                if renewal.done():
+                    renewal.result()  # raises: the renewal ends only by a bug
                 for _, entries in streams or ():
                     for newest, fields in entries:
                         events, last = _unpack_events(fields[b"events"]), int(fields[b"last"])
-                        # Counting begins anew when nothing was published for as long as it is kept
+                        # The count starts again when nothing was published until it expired
                         missed = max(last - len(events) - seen, 0) if last > seen else 0
                         entry_id, seen = newest, last
                         yield events, missed
-        except Exception as error:
+        except STORE_FAILURES as error:
             raise store_error(reason_of(error)) from error
         finally:
-            if renewing is not None:
-                renewing.cancel()
-                await asyncio.gather(renewing, return_exceptions=True)
+            if renewal is not None:
+                renewal.cancel()
+                await asyncio.gather(renewal, return_exceptions=True)
 
     async def _renew(self, keys: SceneKeys) -> None:
         while True:
             await asyncio.sleep(_WATCHED_MS / 5000)
-            with suppress(Exception):  # the reader finds out what there is to be told
-                await self._watching.set(keys.watched, 1, px=_WATCHED_MS)
+            with suppress(*STORE_FAILURES):  # the reader will notice the failure
+                await self._watch_client.set(keys.watched, 1, px=_WATCHED_MS)
 
     async def close(self) -> None:
         await self._client.aclose()
-        await self._watching.aclose()
+        await self._watch_client.aclose()
 
     @asynccontextmanager
-    async def _at_hand(self, scene_id: str) -> AsyncGenerator[_Scene, None]:
-        """A scene, for one call at a time."""
+    async def _locked(self, scene_id: str) -> AsyncGenerator[_Scene, None]:
+        """Hold the lock of a scene."""
         scene = self._scenes.setdefault(scene_id, _Scene())
         self._scenes.move_to_end(scene_id)
         scene.users += 1
         try:
             async with scene.lock:
                 if self._now() - scene.used > self._expiry_ms / 1000:
-                    scene.forget()  # in Redis it has gone as well, or another server goes on with it
+                    scene.clear()  # in Redis it has expired too, or another server continues it
                 yield scene
         finally:
             scene.users -= 1
@@ -229,10 +230,10 @@ class RedisStore(TrackStore):
             self._agents -= self._scenes.pop(unused).agents
 
     async def _call(self, scene_id: str, scene: _Scene, entry: bytes = b"", key: bytes = b"") -> bool:
-        """Appends an entry, if one is given, after all that others appended was read.
+        """Read what other servers appended to the log, then append an entry, if given.
 
         Returns:
-            Whether somebody watches.
+            Whether the scene has a watcher.
         """
         keys = SceneKeys(scene_id)
         arguments: list[str | bytes | int] = [
@@ -248,36 +249,37 @@ class RedisStore(TrackStore):
         try:
             reply = await self._append.run(self._client, [keys.log, keys.watched], arguments)
         except ReadOnlyError:
-            # What is behind the address is another server's replica by now: the next call connects anew
+            # The server at this address has become a replica: close the connections, to find the new master
             if isinstance(self._client, Redis):
                 await self._client.connection_pool.disconnect(inuse_connections=False)
             raise
         log, last, continues, same, watched, entries = reply
         if not continues:
             scene.lost = scene.lost or (bool(scene.log) and not same)
-            scene.forget()
+            scene.clear()
         try:
             for number, packed in enumerate(entries, start=last - len(entries) + 1):
-                scene.missed.extend(self._read(scene, number, packed))
+                scene.unreported.extend(self._apply_packed(scene, number, packed))
                 if len(entries) > 1:
-                    await asyncio.sleep(0)  # a log of seconds takes a while, and other calls wait
+                    await asyncio.sleep(0)  # a whole log takes a while, and other calls wait
         except BaseException:
-            scene.forget()  # it is read again: nothing of it may be taken twice
+            scene.clear()  # the log is read again from its start, so that no entry is applied twice
             raise
         scene.log = log if entry or last else b""
         return bool(watched)
 
-    def _read(self, scene: _Scene, number: int, packed: bytes) -> list[Instant]:
+    def _apply_packed(self, scene: _Scene, number: int, packed: bytes) -> list[Instant]:
+        """Apply an entry of the log and return the instants that no call has reported."""
         key = packed[:_KEY_BYTES]
         try:
-            outcome = scene.apply(number, key, unpack_entry(packed[_KEY_BYTES:]))
-        except EntryError as error:
-            _log.warning("an entry of a scene's log was left out", why=str(error))
+            result = scene.apply(number, key, unpack_log_entry(packed[_KEY_BYTES:]))
+        except LogEntryError as error:
+            _log.warning("entry of a scene's log skipped", why=str(error))
             scene.skip(number, key)
             return []
-        if self._unanswered.pop(key, self) is self:
+        if self._unanswered.pop(key, self) is self:  # another server's entry, which reports it itself
             return []
-        return outcome.instants
+        return result.instants
 
 
 def _unpack_events(packed: bytes) -> list[bytes]:

@@ -5,10 +5,10 @@ from collections.abc import AsyncIterator, Sequence
 
 import pytest
 
-from service.tracking.store.base import Event, Fate, Recalled, Sighting, TrackStore
+from service.tracking.store.base import ExchangeResult, SceneStatus, TrackStatus, TrackStore, TrackUpdate
 from service.tracking.store.records import COMPLETE, NEWLY, SETTLED, unpack_instants
-from tests.service.tracking.store.sightings import SERIES, observation, sighting, times, where
 from tests.service.tracking.store.stores import memory, opened, scene_name
+from tests.service.tracking.store.track_updates import MODEL, observation, times, track_update, where
 
 
 @pytest.fixture(params=["memory", "redis", "cluster"])
@@ -21,19 +21,19 @@ async def store(request: pytest.FixtureRequest) -> AsyncIterator[TrackStore]:
         yield opened_store
 
 
-async def replay(store: TrackStore, scene: str, moments: Sequence[float]) -> list[Recalled]:
-    return [await store.exchange(scene, t, [sighting(t)]) for t in moments]
+async def replay(store: TrackStore, scene: str, moments: Sequence[float]) -> list[ExchangeResult]:
+    return [await store.exchange(scene, t, [track_update(t)]) for t in moments]
 
 
-def newly(answers: Sequence[Recalled]) -> list[tuple[str, str, float]]:
+def newly(answers: Sequence[ExchangeResult]) -> list[tuple[str, str, float]]:
     """What was settled, in order."""
     return [
-        (agent_id, series, float(row["time"]))
+        (agent_id, model, float(row["time"]))
         for answer in answers
-        for row, agent_id, series in zip(
+        for row, agent_id, model in zip(
             unpack_instants(answer.instants.packed),
             answer.instants.agent_ids,
-            answer.instants.series,
+            answer.instants.models,
             strict=True,
         )
         if row["flags"] & NEWLY
@@ -43,9 +43,9 @@ def newly(answers: Sequence[Recalled]) -> list[tuple[str, str, float]]:
 async def test_a_scene_from_its_beginning(store: TrackStore) -> None:
     moments = times(15)
     answers = await replay(store, scene_name(), moments)
-    assert [answer.event for answer in answers] == [Event.BEGUN] + [Event.KEPT] * 14
-    assert [answer.fates for answer in answers] == [[Fate.NEW]] + [[Fate.KEPT]] * 14
-    assert newly(answers) == [("a", SERIES, moment) for moment in moments[12:]]
+    assert [answer.scene_status for answer in answers] == [SceneStatus.NEW] + [SceneStatus.KEPT] * 14
+    assert [answer.track_statuses for answer in answers] == [[TrackStatus.NEW]] + [[TrackStatus.KEPT]] * 14
+    assert newly(answers) == [("a", MODEL, moment) for moment in moments[12:]]
     assert all(list(answer.instants.agent_ids) == ["a"] for answer in answers)
     assert not any(answer.watched or answer.histories for answer in answers)
 
@@ -55,9 +55,9 @@ async def test_any_name_will_do(store: TrackStore, name: str) -> None:
     scene = scene_name() + name
     moments = times(13)
     for moment in moments:
-        brought = [sighting(moment, name or "a"), sighting(moment, "other", off=9.0)]
+        brought = [track_update(moment, name or "a"), track_update(moment, "other", off=9.0)]
         answer = await store.exchange(scene, moment, brought)
-    assert sorted(newly([answer])) == sorted((one, SERIES, moments[-1]) for one in (name or "a", "other"))
+    assert sorted(newly([answer])) == sorted((one, MODEL, moments[-1]) for one in (name or "a", "other"))
     held = await store.read(scene, 99.0, name or "a")
     assert list(held.agent_ids) == [name or "a"]
     assert len((await store.read(scene, 99.0)).agent_ids) == 2
@@ -68,15 +68,15 @@ async def test_scenes_are_told_apart(store: TrackStore) -> None:
     one, two = scene_name(), scene_name()
     await replay(store, one, times(12))
     assert newly(await replay(store, two, times(13)[12:])) == []
-    assert newly(await replay(store, one, times(13)[12:])) == [("a", SERIES, times(13)[-1])]
+    assert newly(await replay(store, one, times(13)[12:])) == [("a", MODEL, times(13)[-1])]
 
 
 async def test_histories(store: TrackStore) -> None:
     scene = scene_name()
     moments = times(6)
     for moment in moments:
-        brought = [Sighting("a", b"v", observation(moment, where(moment)))]
-        answer = await store.exchange(scene, moment, brought, recall=1.0)
+        brought = [TrackUpdate("a", b"v", observation(moment, where(moment)))]
+        answer = await store.exchange(scene, moment, brought, history_s=1.0)
     assert answer.histories == [b"".join(observation(t, where(t)) for t in moments[-3:])]
 
 
@@ -85,7 +85,7 @@ async def test_all_that_is_remembered_can_be_read(store: TrackStore) -> None:
     moments = times(14)
     for moment in moments:
         await store.exchange(
-            scene, moment, [sighting(moment, "a"), sighting(moment, "b", series="", off=20.0)]
+            scene, moment, [track_update(moment, "a"), track_update(moment, "b", model="", off=20.0)]
         )
     held = await store.read(scene, 99.0)
     assert sorted(held.agent_ids) == ["a", "b"]
@@ -101,7 +101,7 @@ async def test_reading_changes_nothing(store: TrackStore) -> None:
     scene = scene_name()
     await replay(store, scene, times(12))
     await store.read(scene, 99.0)
-    assert newly(await replay(store, scene, times(13)[12:])) == [("a", SERIES, times(13)[-1])]
+    assert newly(await replay(store, scene, times(13)[12:])) == [("a", MODEL, times(13)[-1])]
 
 
 async def test_a_scene_that_was_reset_begins_anew(store: TrackStore) -> None:
@@ -110,26 +110,26 @@ async def test_a_scene_that_was_reset_begins_anew(store: TrackStore) -> None:
     assert await store.reset(scene) == 1
     assert await store.reset(scene) == 0
     (answer,) = await replay(store, scene, times(13)[12:])
-    assert (answer.event, answer.fates) == (Event.BEGUN, [Fate.NEW])
+    assert (answer.scene_status, answer.track_statuses) == (SceneStatus.NEW, [TrackStatus.NEW])
     assert newly([answer]) == []
 
 
 async def test_calls_at_once_are_as_calls_in_a_row(store: TrackStore) -> None:
     scene = scene_name()
     moments = times(40)
-    answers = await asyncio.gather(*(store.exchange(scene, t, [sighting(t)]) for t in moments))
-    assert sorted(newly(answers)) == [("a", SERIES, moment) for moment in moments[12:]]
+    answers = await asyncio.gather(*(store.exchange(scene, t, [track_update(t)]) for t in moments))
+    assert sorted(newly(answers)) == [("a", MODEL, moment) for moment in moments[12:]]
 
 
 async def test_those_who_watch_are_told(store: TrackStore) -> None:
     scene = scene_name()
     moment = times(1)[0]
-    assert not (await store.exchange(scene, moment, [sighting(moment)])).watched
+    assert not (await store.exchange(scene, moment, [track_update(moment)])).watched
     source = store.watch(scene)
     async with asyncio.timeout(20):
         assert await anext(source) == ((), 0)
-        assert (await store.exchange(scene, moment, [sighting(moment)])).watched
-        assert not (await store.exchange(scene_name(), moment, [sighting(moment)])).watched
+        assert (await store.exchange(scene, moment, [track_update(moment)])).watched
+        assert not (await store.exchange(scene_name(), moment, [track_update(moment)])).watched
         await store.publish(scene_name(), [b"of another scene"])
         await store.publish(scene, [b"1", b"2"])
         await store.publish(scene, [b"3"])

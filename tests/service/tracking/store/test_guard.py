@@ -1,4 +1,4 @@
-"""The guard: what callers and counts are told, and what becomes of calls that nobody waits for."""
+"""Guard and circuit breaker: results, metrics, and calls that nobody waits for."""
 
 import asyncio
 import gc
@@ -12,7 +12,7 @@ from redis import exceptions as redis_errors
 
 from service.redis_url import parse_address
 from service.tracking.store.base import StoreError
-from service.tracking.store.guard import Guard
+from service.tracking.store.guard import CircuitBreaker, Guard
 from service.tracking.store.redis.connection import connect
 from tests.service.tracking.store.redis_servers import FaultProxy
 
@@ -127,7 +127,7 @@ async def test_a_caller_in_a_hurry_blames_nobody(watched: Watched) -> None:
     late: list[str] = []
     for _ in range(5):
         with pytest.raises(StoreError):
-            await watched.guard.run("exchange", call, LONG, late.append, patience_s=SHORT)
+            await watched.guard.run("exchange", call, LONG, late.append, time_left_s=SHORT)
     may_end.set()
     assert await watched.guard.run("exchange", call, LONG) == "late"  # the circuit is closed
     await asyncio.sleep(0)
@@ -188,7 +188,7 @@ async def test_no_more_calls_than_it_may_have_under_way() -> None:
         with pytest.raises(StoreError):
             await watched.guard.run("read", call, SHORT)
     third = Held()
-    with pytest.raises(StoreError, match="too much"):
+    with pytest.raises(StoreError, match="overloaded"):
         await watched.guard.run("read", third, LONG)
     assert not third.begun.is_set()
     assert watched.failures == {("read", "timeout"): 2, ("read", "saturated"): 1}
@@ -201,7 +201,7 @@ async def test_no_more_calls_than_it_may_have_under_way() -> None:
 async def test_failures_open_the_circuit_and_one_call_closes_it(watched: Watched) -> None:
     await watched.open_circuit()
     unmade = Held()
-    with pytest.raises(StoreError, match="left alone"):
+    with pytest.raises(StoreError, match="not called"):
         await watched.guard.run("read", unmade, LONG)
     assert not unmade.begun.is_set()
     assert watched.failures == {("read", "circuit_open"): 1}
@@ -209,7 +209,7 @@ async def test_failures_open_the_circuit_and_one_call_closes_it(watched: Watched
     probe = Held()
     deciding = asyncio.create_task(watched.guard.run("read", probe, LONG))
     await probe.begun.wait()
-    with pytest.raises(StoreError, match="left alone"):
+    with pytest.raises(StoreError, match="not called"):
         await watched.guard.run("read", unmade, LONG)
     probe.release.set()
     assert await deciding == "answer"
@@ -224,7 +224,7 @@ async def test_calls_over_their_budget_open_the_circuit_though_they_succeed_late
     for call in calls:
         call.release.set()
     await until_idle(watched.guard)
-    with pytest.raises(StoreError, match="left alone"):
+    with pytest.raises(StoreError, match="not called"):
         await watched.guard.run("read", answer, LONG)
 
 
@@ -262,14 +262,14 @@ async def test_the_deciding_call_decides_though_its_caller_goes_away(
     caller.cancel()
     with pytest.raises(asyncio.CancelledError):
         await caller
-    with pytest.raises(StoreError, match="left alone"):
+    with pytest.raises(StoreError, match="not called"):
         await watched.guard.run("read", answer, LONG)
     probe.release.set()
     await until_idle(watched.guard)
     if error is None:
         assert await watched.guard.run("read", answer, LONG) == "answer"
     else:
-        with pytest.raises(StoreError, match="left alone"):
+        with pytest.raises(StoreError, match="not called"):
             await watched.guard.run("read", answer, LONG)
         assert watched.failures[("read", "refused")] == 1
 
@@ -335,7 +335,7 @@ async def test_many_calls_at_once_against_a_network_that_hangs(redis_proxy: Faul
         assert time.perf_counter() - started < 5
         assert all(isinstance(result, StoreError) for result in results)
         assert watched.failures == {("read", "timeout"): 8, ("read", "saturated"): 42}
-        with pytest.raises(StoreError, match="left alone"):
+        with pytest.raises(StoreError, match="not called"):
             await call(0.02)
         redis_proxy.set("pass")
         await until_idle(watched.guard)
@@ -344,3 +344,85 @@ async def test_many_calls_at_once_against_a_network_that_hangs(redis_proxy: Faul
     finally:
         await watched.guard.close()
         await client.aclose()
+
+
+class Clock:
+    """Shows what it is told."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def circuit(clock: Clock) -> CircuitBreaker:
+    return CircuitBreaker(failures=3, pause_s=0.25, max_pause_s=2.0, clock=clock)
+
+
+def call(circuit: CircuitBreaker, success: bool) -> None:
+    """A call that ends before anything else happens."""
+    assert circuit.ready
+    circuit.end(circuit.begin(), success)
+
+
+def test_it_opens_after_failures_in_a_row(circuit: CircuitBreaker) -> None:
+    for success in (False, False, True, False, False, True):
+        call(circuit, success)
+    for _ in range(3):
+        call(circuit, False)
+    assert not circuit.ready
+
+
+def test_one_call_decides_after_the_pause(circuit: CircuitBreaker, clock: Clock) -> None:
+    for _ in range(3):
+        call(circuit, False)
+    clock.now += 0.2499
+    assert not circuit.ready
+    clock.now += 0.0001
+    assert circuit.ready
+    probe = circuit.begin()
+    assert probe
+    assert not circuit.ready
+    clock.now += 1000
+    assert not circuit.ready
+    circuit.end(probe, True)
+    assert circuit.ready
+    assert not circuit.begin()
+
+
+def test_pauses_double_up_to_the_longest_and_begin_anew(circuit: CircuitBreaker, clock: Clock) -> None:
+    for _ in range(3):
+        call(circuit, False)
+    for pause in (0.25, 0.5, 1.0, 2.0, 2.0):
+        clock.now += pause - 0.0001
+        assert not circuit.ready
+        clock.now += 0.0001
+        call(circuit, False)
+    clock.now += 2.0
+    call(circuit, True)
+    for _ in range(3):
+        call(circuit, False)
+    clock.now += 0.25
+    assert circuit.ready
+
+
+def test_calls_from_before_it_opened_decide_nothing(circuit: CircuitBreaker, clock: Clock) -> None:
+    old = [circuit.begin() for _ in range(6)]
+    for probe in old[:3]:
+        circuit.end(probe, False)
+    clock.now += 0.2
+    circuit.end(old[3], False)
+    circuit.end(old[4], True)
+    assert not circuit.ready
+    clock.now += 0.05
+    probe = circuit.begin()
+    circuit.end(old[5], True)
+    assert probe
+    assert not circuit.ready

@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.tracking.store.base import Sighting
-from service.tracking.store.log_entry import Entry, EntryError, pack_entry, unpack_entry
+from service.tracking.store.base import TrackUpdate
+from service.tracking.store.log_entry import LogEntry, LogEntryError, pack_log_entry, unpack_log_entry
 from service.tracking.store.records import FORECAST_BYTES, OBSERVATION_BYTES
 
-SIGHTINGS = st.builds(
-    Sighting,
+UPDATES = st.builds(
+    TrackUpdate,
     st.text(min_size=1),
     st.sampled_from([b"v", b"p", b"c", b"u"]),
     st.binary(min_size=OBSERVATION_BYTES, max_size=OBSERVATION_BYTES).map(lambda one: one * 2),
@@ -20,23 +20,23 @@ SIGHTINGS = st.builds(
 )
 
 
-@given(st.floats(allow_nan=False), st.lists(SIGHTINGS, max_size=4))
-def test_what_is_packed_comes_back(time: float, sightings: list[Sighting]) -> None:
-    entry = Entry(time, sightings)
-    assert unpack_entry(pack_entry(entry)) == entry
+@given(st.floats(allow_nan=False), st.lists(UPDATES, max_size=4))
+def test_what_is_packed_comes_back(time: float, updates: list[TrackUpdate]) -> None:
+    entry = LogEntry(time, updates)
+    assert unpack_log_entry(pack_log_entry(entry)) == entry
 
 
 @given(st.binary())
 def test_other_bytes_are_refused(packed: bytes) -> None:
-    with pytest.raises(EntryError):
-        unpack_entry(packed)
+    with pytest.raises(LogEntryError):
+        unpack_log_entry(packed)
 
 
 @given(st.data())
 def test_half_an_entry_is_refused(data: st.DataObject) -> None:
-    packed = pack_entry(Entry(1.0, [data.draw(SIGHTINGS)]))
-    with pytest.raises(EntryError):
-        unpack_entry(packed[: data.draw(st.integers(0, len(packed) - 1))])
+    packed = pack_log_entry(LogEntry(1.0, [data.draw(UPDATES)]))
+    with pytest.raises(LogEntryError):
+        unpack_log_entry(packed[: data.draw(st.integers(0, len(packed) - 1))])
 
 
 @pytest.mark.parametrize(
@@ -54,5 +54,5 @@ def test_half_an_entry_is_refused(data: st.DataObject) -> None:
     ],
 )
 def test_another_layout_is_refused(document: object) -> None:
-    with pytest.raises(EntryError):
-        unpack_entry(msgpack.packb(document))
+    with pytest.raises(LogEntryError):
+        unpack_log_entry(msgpack.packb(document))

@@ -7,28 +7,35 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.tracking.store.base import MAX_FORECASTS, MAX_SERIES, SETTLE_AFTER, WINDOW, Fate, Sighting
-from service.tracking.store.log_entry import Entry
+from service.tracking.store.base import (
+    MAX_FORECASTS,
+    MAX_MODELS,
+    SETTLE_AFTER,
+    WINDOW,
+    TrackStatus,
+    TrackUpdate,
+)
+from service.tracking.store.log_entry import LogEntry
 from service.tracking.store.records import AGES, COMPLETE, NEWLY, SETTLED, unpack_instants
-from service.tracking.store.scene import Outcome, SceneMemory
-from service.tracking.store.track import bundle
-from tests.service.tracking.store.sightings import SERIES, START, observation, sighting, times, where
+from service.tracking.store.scene import ApplyResult, SceneMemory
+from service.tracking.store.track import join_instants
+from tests.service.tracking.store.track_updates import MODEL, START, observation, times, track_update, where
 
 
-def replay(scene: SceneMemory, moments: list[float], **options: object) -> list[Outcome]:
-    return [scene.apply(Entry(t, [sighting(t, **options)])) for t in moments]  # type: ignore[arg-type]
+def replay(scene: SceneMemory, moments: list[float], **options: object) -> list[ApplyResult]:
+    return [scene.apply(LogEntry(t, [track_update(t, **options)])) for t in moments]  # type: ignore[arg-type]
 
 
-def settled(outcomes: list[Outcome]) -> dict[tuple[str, str, float], np.void]:
-    """What was settled, by agent, series and time; fails where something was settled twice."""
+def settled(outcomes: list[ApplyResult]) -> dict[tuple[str, str, float], np.void]:
+    """What was settled, by agent, model and time; fails where something was settled twice."""
     found: dict[tuple[str, str, float], np.void] = {}
     for outcome in outcomes:
-        told = bundle(outcome.instants)
-        for row, agent_id, series in zip(
-            unpack_instants(told.packed), told.agent_ids, told.series, strict=True
+        told = join_instants(outcome.instants)
+        for row, agent_id, model in zip(
+            unpack_instants(told.packed), told.agent_ids, told.models, strict=True
         ):
             if row["flags"] & NEWLY:
-                key = agent_id, series, float(row["time"])
+                key = agent_id, model, float(row["time"])
                 assert key not in found
                 assert row["flags"] == COMPLETE | SETTLED | NEWLY
                 found[key] = row
@@ -39,7 +46,7 @@ def test_a_set_is_complete_from_the_thirteenth_frame_on() -> None:
     moments = list(times(16))
     found = settled(replay(SceneMemory(), moments, miss=0.25))
     assert sorted(time for _, _, time in found) == moments[12:]
-    row = found["a", SERIES, moments[12]]
+    row = found["a", MODEL, moments[12]]
     assert row["made_at"].tolist() == moments[11::-1]
     assert row["position"].tolist() == list(where(moments[12]))
     at = row["blocks"]["point"][:, 1]
@@ -77,7 +84,7 @@ def test_a_second_answer_tells_what_was_settled_but_not_anew() -> None:
     scene = SceneMemory()
     replay(scene, list(times(13)))
     (outcome,) = replay(scene, [times(13)[-1]])
-    (instant,) = unpack_instants(bundle(outcome.instants).packed)
+    (instant,) = unpack_instants(join_instants(outcome.instants).packed)
     assert instant["flags"] == COMPLETE | SETTLED
 
 
@@ -88,7 +95,7 @@ def test_of_one_time_what_came_first_is_kept() -> None:
         replay(scene, [moment], miss=1.0)
         replay(scene, [moment], miss=7.0)
     found = settled(replay(scene, moments[12:]))
-    assert found["a", SERIES, moments[12]]["blocks"]["point"][:, 1, 1].tolist() == [1.0] * AGES
+    assert found["a", MODEL, moments[12]]["blocks"]["point"][:, 1, 1].tolist() == [1.0] * AGES
 
 
 def test_a_missing_frame_leaves_sets_incomplete() -> None:
@@ -108,7 +115,7 @@ def test_forecasts_off_their_lags_settle_two_seconds_later() -> None:
         found = settled([outcome])
         due = [t for t in moments[12:number] if moment - t >= SETTLE_AFTER > moments[number - 1] - t]
         assert [time for _, _, time in found] == due
-        newest = unpack_instants(bundle(outcome.instants).packed)[0]
+        newest = unpack_instants(join_instants(outcome.instants).packed)[0]
         assert newest["flags"] == (COMPLETE if number >= 12 else 0)
 
 
@@ -118,15 +125,15 @@ async def test_the_nearest_forecast_is_taken_and_none_beyond_the_tolerance() -> 
     for moment in moments[:12]:
         replay(scene, [moment - 0.08, moment + 0.04])
     replay(scene, [moments[12], moments[12] + SETTLE_AFTER])
-    _, instants = await scene.everything(99.0)
-    rows = unpack_instants(bundle(instants).packed)
+    _, instants = await scene.snapshot(99.0)
+    rows = unpack_instants(join_instants(instants).packed)
     (row,) = rows[rows["time"] == moments[12]]
     assert np.allclose(row["made_at"], np.array(moments[11::-1]) + 0.04, rtol=0, atol=1e-6)
 
     other = SceneMemory()
     replay(other, [moment + 0.12 for moment in moments[:12]])
     (outcome,) = replay(other, [moments[12]])
-    (row,) = unpack_instants(bundle(outcome.instants).packed)
+    (row,) = unpack_instants(join_instants(outcome.instants).packed)
     assert row["flags"] == 0
     assert np.isnan(row["made_at"]).all()
 
@@ -135,50 +142,50 @@ def test_a_shorter_horizon_never_completes_a_set() -> None:
     scene = SceneMemory()
     outcomes = replay(scene, list(times(20)), steps=6)
     assert not settled(outcomes)
-    row = unpack_instants(bundle(outcomes[-1].instants).packed)[0]
+    row = unpack_instants(join_instants(outcomes[-1].instants).packed)[0]
     assert np.isfinite(row["made_at"]).tolist() == [True] * 6 + [False] * 6
     assert np.isnan(row["blocks"]["point"][5, 2]).all()
 
 
-def test_every_model_has_a_series_of_its_own() -> None:
+def test_every_model_has_a_forecast_history_of_its_own() -> None:
     scene = SceneMemory()
-    outcomes: list[Outcome] = []
+    outcomes: list[ApplyResult] = []
     for moment in times(14):
-        for series in ("cab@1.0.0", "kalman@1.0.0"):
-            outcomes += replay(scene, [moment], series=series)
+        for model in ("cab@1.0.0", "kalman@1.0.0"):
+            outcomes += replay(scene, [moment], model=model)
     found = settled(outcomes)
-    assert {(series, time) for _, series, time in found} == {
-        (series, time) for series in ("cab@1.0.0", "kalman@1.0.0") for time in times(14)[12:]
+    assert {(model, time) for _, model, time in found} == {
+        (model, time) for model in ("cab@1.0.0", "kalman@1.0.0") for time in times(14)[12:]
     }
 
 
-def test_an_observation_is_the_truth_for_every_series() -> None:
+def test_an_observation_is_the_truth_for_every_model() -> None:
     """As where an agent falls back to another model for one frame."""
     scene = SceneMemory()
     moments = list(times(13))
     replay(scene, moments[:12])
-    found = settled(replay(scene, moments[12:], series="constant-velocity-yaw@1.0.0"))
-    assert list(found) == [("a", SERIES, moments[12])]
+    found = settled(replay(scene, moments[12:], model="constant-velocity-yaw@1.0.0"))
+    assert list(found) == [("a", MODEL, moments[12])]
 
 
 def test_agents_are_told_apart() -> None:
     scene = SceneMemory()
     outcomes = [
-        scene.apply(Entry(t, [sighting(t, "a", miss=1.0), sighting(t, "b", off=50.0, miss=2.0)]))
+        scene.apply(LogEntry(t, [track_update(t, "a", miss=1.0), track_update(t, "b", off=50.0, miss=2.0)]))
         for t in times(13)
     ]
     found = settled(outcomes)
     time = times(13)[-1]
-    assert found["a", SERIES, time]["blocks"]["point"][0, 1].tolist() == [where(time)[0], 1.0]
-    assert found["b", SERIES, time]["blocks"]["point"][0, 1].tolist() == [where(time)[0], 52.0]
+    assert found["a", MODEL, time]["blocks"]["point"][0, 1].tolist() == [where(time)[0], 1.0]
+    assert found["b", MODEL, time]["blocks"]["point"][0, 1].tolist() == [where(time)[0], 52.0]
 
 
 def test_another_type_begins_anew() -> None:
     scene = SceneMemory()
     first = replay(scene, list(times(12)))
-    assert [outcome.fates for outcome in first] == [[Fate.NEW]] + [[Fate.KEPT]] * 11
-    (outcome,) = replay(scene, [times(13)[-1]], kind=b"p")
-    assert outcome.fates == [Fate.RESET]
+    assert [outcome.track_statuses for outcome in first] == [[TrackStatus.NEW]] + [[TrackStatus.KEPT]] * 11
+    (outcome,) = replay(scene, [times(13)[-1]], agent_type=b"p")
+    assert outcome.track_statuses == [TrackStatus.RESET]
     assert not settled([outcome])
 
 
@@ -187,15 +194,15 @@ def test_an_id_that_another_agent_has_begins_anew(off: float) -> None:
     scene = SceneMemory()
     replay(scene, list(times(12)))
     (outcome,) = replay(scene, [times(13)[-1]], off=off)
-    assert outcome.fates == [Fate.RESET]
+    assert outcome.track_statuses == [TrackStatus.RESET]
     assert not settled([outcome])
 
 
 def test_a_contradiction_at_one_time_begins_anew_but_noise_does_not() -> None:
     scene = SceneMemory()
     replay(scene, list(times(3)))
-    assert [o.fates for o in replay(scene, [times(3)[-1]], off=0.09)] == [[Fate.KEPT]]
-    assert [o.fates for o in replay(scene, [times(3)[-1]], off=0.11)] == [[Fate.RESET]]
+    assert [o.track_statuses for o in replay(scene, [times(3)[-1]], off=0.09)] == [[TrackStatus.KEPT]]
+    assert [o.track_statuses for o in replay(scene, [times(3)[-1]], off=0.11)] == [[TrackStatus.RESET]]
 
 
 @pytest.mark.parametrize("jump", [2.1, 3.04, 3600.0])
@@ -206,7 +213,9 @@ def test_a_clock_that_jumps_back_begins_anew(jump: float, step: float) -> None:
     replay(scene, moments, speed=1.0)
     back = [moments[-1] - jump + step * number for number in range(round(7 / step))]
     outcomes = replay(scene, back, speed=1.0, off=0.01)
-    assert [outcome.fates[0] for outcome in outcomes] == [Fate.RESET] + [Fate.KEPT] * (len(back) - 1)
+    assert [outcome.track_statuses[0] for outcome in outcomes] == [TrackStatus.RESET] + [TrackStatus.KEPT] * (
+        len(back) - 1
+    )
     found = settled(outcomes)
     assert found
     assert all((row["made_at"] >= back[0]).all() for row in found.values())
@@ -217,8 +226,8 @@ def test_a_clock_that_jumps_back_a_little_is_seen_where_the_agent_is() -> None:
     replay(scene, list(times(20, 0.1)))
     step_back = times(20, 0.1)[9]
     at = observation(step_back, where(times(21, 0.1)[-1]))  # it has gone on meanwhile
-    outcome = scene.apply(Entry(step_back, [Sighting("a", b"v", at)]))
-    assert outcome.fates == [Fate.RESET]
+    outcome = scene.apply(LogEntry(step_back, [TrackUpdate("a", b"v", at)]))
+    assert outcome.track_statuses == [TrackStatus.RESET]
 
 
 @pytest.mark.parametrize(("step", "jitter"), [(0.5, 0.04), (0.1, 0.02), (0.1, 0.049)])
@@ -240,9 +249,9 @@ def test_who_is_always_late_is_as_well_known() -> None:
     outcomes = []
     for moment in times(80):
         t = moment + rng.uniform(-0.04, 0.04)
-        outcomes.append(scene.apply(Entry(t, [sighting(t, "prompt")])))
+        outcomes.append(scene.apply(LogEntry(t, [track_update(t, "prompt")])))
         t = moment - 1.5 + rng.uniform(-0.04, 0.04)
-        outcomes.append(scene.apply(Entry(t, [sighting(t, "late", off=9.0)])))
+        outcomes.append(scene.apply(LogEntry(t, [track_update(t, "late", off=9.0)])))
     counts = {name: sum(key[0] == name for key in settled(outcomes)) for name in ("prompt", "late")}
     assert counts["prompt"] > 60
     assert abs(counts["late"] - counts["prompt"]) <= 1  # at the end one of them has yet to wait
@@ -252,32 +261,32 @@ async def test_what_is_older_than_the_window_is_forgotten() -> None:
     scene = SceneMemory()
     replay(scene, list(times(12)))
     far = START + 5.5 + WINDOW + 0.1
-    scene.apply(Entry(far, [sighting(far, "b")]))
-    assert (await scene.everything(99.0))[0] == ["b"]
+    scene.apply(LogEntry(far, [track_update(far, "b")]))
+    assert (await scene.snapshot(99.0))[0] == ["b"]
     (outcome,) = replay(scene, [far])
-    assert outcome.fates == [Fate.NEW]
+    assert outcome.track_statuses == [TrackStatus.NEW]
 
 
 def test_memory_is_bounded() -> None:
     scene = SceneMemory()
     for number, moment in enumerate(times(3000, 0.01)):
-        scene.apply(Entry(moment, [sighting(moment, series=f"m@{number % (MAX_SERIES + 5)}")]))
+        scene.apply(LogEntry(moment, [track_update(moment, model=f"m@{number % (MAX_MODELS + 5)}")]))
     track = scene._tracks["a"]
-    assert len(track._series) == MAX_SERIES
-    assert all(len(series.times) <= MAX_FORECASTS for series in track._series.values())
-    assert all(series.times == sorted(series._forecasts) for series in track._series.values())
-    assert len(track._seen) <= WINDOW / 0.01 + 1
+    assert len(track._forecasts) == MAX_MODELS
+    assert all(len(history.times) <= MAX_FORECASTS for history in track._forecasts.values())
+    assert all(history.times == sorted(history._forecasts) for history in track._forecasts.values())
+    assert len(track._observations) <= WINDOW / 0.01 + 1
 
 
 def test_histories_are_what_was_seen_up_to_the_call() -> None:
     scene = SceneMemory()
     moments = list(times(10))
     for moment in moments:
-        scene.apply(Entry(moment, [sighting(moment, series="")]))
+        scene.apply(LogEntry(moment, [track_update(moment, model="")]))
 
     def recalled(time: float, recall: float) -> list[float]:
-        brought = Sighting("a", b"v", observation(time, where(time)))
-        (history,) = scene.apply(Entry(time, [brought]), recall=recall).histories
+        brought = TrackUpdate("a", b"v", observation(time, where(time)))
+        (history,) = scene.apply(LogEntry(time, [brought]), history_s=recall).histories
         return np.frombuffer(history).reshape(-1, 9)[:, 0].tolist()  # type: ignore[no-any-return]
 
     assert recalled(moments[-1] + 0.5, 2.0) == [*moments[-4:], moments[-1] + 0.5]
@@ -289,7 +298,7 @@ def test_all_that_a_call_brings_goes_into_the_history() -> None:
     scene = SceneMemory()
     moments = list(times(4))
     packed = b"".join(observation(t, where(t)) for t in moments)
-    outcome = scene.apply(Entry(moments[-1], [Sighting("a", b"v", packed)]), recall=5.0)
+    outcome = scene.apply(LogEntry(moments[-1], [TrackUpdate("a", b"v", packed)]), history_s=5.0)
     assert outcome.histories == [packed]
 
 
@@ -306,9 +315,9 @@ def test_nothing_is_settled_twice_or_without_every_age(
 ) -> None:
     scene = SceneMemory()
     outcomes = []
-    for number, agent_id, series, jitter in calls:
+    for number, agent_id, model, jitter in calls:
         t = START + 0.5 * number + jitter
-        outcomes.append(scene.apply(Entry(t, [sighting(t, agent_id, series=series, speed=1.0)])))
+        outcomes.append(scene.apply(LogEntry(t, [track_update(t, agent_id, model=model, speed=1.0)])))
     for row in settled(outcomes).values():
         ages = row["time"] - row["made_at"]
         assert (np.abs(ages - 0.5 * np.arange(1, AGES + 1)) <= 0.0902).all()

@@ -9,13 +9,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from redis.exceptions import OutOfMemoryError
 
-from service.tracking.store.base import Event, Fate, Recalled, TrackStore
+from service.tracking.store.base import ExchangeResult, SceneStatus, TrackStatus, TrackStore
 from service.tracking.store.records import NEWLY, unpack_instants
-from service.tracking.store.redis.keys import SceneKeys
+from service.tracking.store.redis.scripts import SceneKeys
 from service.tracking.store.redis.store import MAX_ENTRIES, RedisStore
 from tests.service.tracking.store.redis_servers import Process, single
-from tests.service.tracking.store.sightings import START, sighting, times
 from tests.service.tracking.store.stores import memory, opened, scene_name
+from tests.service.tracking.store.track_updates import START, times, track_update
 
 
 @pytest.fixture
@@ -31,24 +31,24 @@ async def other(redis_server: Process) -> AsyncIterator[RedisStore]:
         yield one
 
 
-def rows(answers: Sequence[Recalled]) -> list[bytes]:
+def rows(answers: Sequence[ExchangeResult]) -> list[bytes]:
     """What was settled, in order of time and agent."""
     found = []
     for answer in answers:
         told = answer.instants
-        for row, agent_id, series in zip(
-            unpack_instants(told.packed), told.agent_ids, told.series, strict=True
+        for row, agent_id, model in zip(
+            unpack_instants(told.packed), told.agent_ids, told.models, strict=True
         ):
             if row["flags"] & NEWLY:
-                found.append((float(row["time"]), agent_id, series, row.tobytes()))
+                found.append((float(row["time"]), agent_id, model, row.tobytes()))
     return [row for *_, row in sorted(found)]
 
 
-async def replay(stores: Sequence[TrackStore], scene: str, moments: Sequence[float]) -> list[Recalled]:
+async def replay(stores: Sequence[TrackStore], scene: str, moments: Sequence[float]) -> list[ExchangeResult]:
     """Calls to the stores in turn."""
     return [
         await stores[number % len(stores)].exchange(
-            scene, t, [sighting(t), sighting(t, "b", off=9.0, miss=1.0)]
+            scene, t, [track_update(t), track_update(t, "b", off=9.0, miss=1.0)]
         )
         for number, t in enumerate(moments)
     ]
@@ -92,7 +92,7 @@ async def test_a_server_that_starts_midway_knows_all(store: RedisStore, redis_se
     answers = await replay([store], scene, moments[:20])
     async with opened(redis_server.url) as fresh:
         answers += await replay([fresh], scene, moments[20:])
-    assert [answer.event for answer in answers] == [Event.BEGUN] + [Event.KEPT] * 29
+    assert [answer.scene_status for answer in answers] == [SceneStatus.NEW] + [SceneStatus.KEPT] * 29
     assert rows(answers) == rows(await replay([memory()], scene, moments))
 
 
@@ -116,12 +116,12 @@ async def test_whatever_comes_both_memories_say_the_same(
     calls: list[tuple[int, int, str, str, float, bytes]],
 ) -> None:
     scene, alone = scene_name(), memory()
-    for server, number, agent_id, series, off, kind in calls:
+    for server, number, agent_id, model, off, kind in calls:
         t = START + 0.5 * number + (off if off < 1 else 0.0)
-        brought = [sighting(t, agent_id, series=series, off=off, kind=kind)]
-        expected = await alone.exchange(scene, t, brought, recall=3.0)
-        answer = await (store, other)[server].exchange(scene, t, brought, recall=3.0)
-        assert (answer.fates, answer.histories) == (expected.fates, expected.histories)
+        brought = [track_update(t, agent_id, model=model, off=off, agent_type=kind)]
+        expected = await alone.exchange(scene, t, brought, history_s=3.0)
+        answer = await (store, other)[server].exchange(scene, t, brought, history_s=3.0)
+        assert (answer.track_statuses, answer.histories) == (expected.track_statuses, expected.histories)
         assert answer.instants == expected.instants
     assert (await other.read(scene, 99.0)).instants == (await alone.read(scene, 99.0)).instants
 
@@ -157,10 +157,16 @@ async def test_a_log_that_is_gone(redis_server: Process, store: RedisStore, othe
     await replay([store, other], scene, times(12))
     redis_server.command("del", SceneKeys(scene).log)
     (answer,) = await replay([store], scene, times(13)[12:])
-    assert (answer.event, answer.fates) == (Event.LOST, [Fate.NEW, Fate.NEW])
+    assert (answer.scene_status, answer.track_statuses) == (
+        SceneStatus.LOST,
+        [TrackStatus.NEW, TrackStatus.NEW],
+    )
     assert rows([answer]) == []
     (answer,) = await replay([other], scene, times(14)[13:])
-    assert (answer.event, answer.fates) == (Event.LOST, [Fate.KEPT, Fate.KEPT])
+    assert (answer.scene_status, answer.track_statuses) == (
+        SceneStatus.LOST,
+        [TrackStatus.KEPT, TrackStatus.KEPT],
+    )
 
 
 async def test_a_reset_by_another_server_is_noticed(store: RedisStore, other: RedisStore) -> None:
@@ -168,7 +174,10 @@ async def test_a_reset_by_another_server_is_noticed(store: RedisStore, other: Re
     await replay([store, other], scene, times(12))
     assert await other.reset(scene) == 2
     (answer,) = await replay([store], scene, times(13)[12:])
-    assert (answer.event, answer.fates) == (Event.LOST, [Fate.NEW, Fate.NEW])
+    assert (answer.scene_status, answer.track_statuses) == (
+        SceneStatus.LOST,
+        [TrackStatus.NEW, TrackStatus.NEW],
+    )
 
 
 async def test_a_log_that_lost_its_end(redis_server: Process, store: RedisStore, other: RedisStore) -> None:
@@ -181,7 +190,10 @@ async def test_a_log_that_lost_its_end(redis_server: Process, store: RedisStore,
     await replay([other], scene, times(16)[14:15])  # another entry takes the number 11
     await replay([other], scene, times(17)[15:16])  # and 12
     (answer,) = await replay([store], scene, times(17)[16:])
-    assert (answer.event, answer.fates) == (Event.LOST, [Fate.KEPT, Fate.KEPT])
+    assert (answer.scene_status, answer.track_statuses) == (
+        SceneStatus.LOST,
+        [TrackStatus.KEPT, TrackStatus.KEPT],
+    )
     assert (await store.read(scene, 99.0)).instants == (await other.read(scene, 99.0)).instants
 
 
@@ -214,7 +226,10 @@ async def test_a_damaged_entry_is_left_out(
     await replay([store], scene, times(12))
     redis_server.command("hset", SceneKeys(scene).log, "5", damaged)
     (answer,) = await replay([other], scene, times(13)[12:])
-    assert (answer.event, answer.fates) == (Event.KEPT, [Fate.KEPT, Fate.KEPT])
+    assert (answer.scene_status, answer.track_statuses) == (
+        SceneStatus.KEPT,
+        [TrackStatus.KEPT, TrackStatus.KEPT],
+    )
     held = unpack_instants((await other.read(scene, 99.0, "a")).instants.packed)
     assert len(held) == 12  # all but one
 
@@ -252,7 +267,7 @@ async def test_the_log_is_bounded_and_expires(redis_server: Process) -> None:
         assert entries <= 23
         assert 11_000 < number(redis_server, "pttl", log) <= 12_000
         for agent in range(MAX_ENTRIES + 50):  # all at one time
-            await store.exchange(scene, times(60)[-1], [sighting(times(60)[-1], f"{agent}", series="")])
+            await store.exchange(scene, times(60)[-1], [track_update(times(60)[-1], f"{agent}", model="")])
         assert (number(redis_server, "hlen", log) - 3) / 2 == MAX_ENTRIES
 
 
@@ -273,7 +288,10 @@ async def test_a_server_that_sat_out_for_long_goes_on(store: RedisStore, other: 
     await replay([store], scene, times(10))
     await replay([other], scene, times(60)[10:])  # by now what the first one knew is no longer needed
     (answer,) = await replay([store], scene, times(61)[60:])
-    assert (answer.event, answer.fates) == (Event.KEPT, [Fate.KEPT, Fate.KEPT])
+    assert (answer.scene_status, answer.track_statuses) == (
+        SceneStatus.KEPT,
+        [TrackStatus.KEPT, TrackStatus.KEPT],
+    )
     assert len(rows([answer])) == 2
 
 
@@ -290,7 +308,7 @@ async def test_reading_takes_nothing_from_the_next_call(
     redis_server.command("del", SceneKeys(scene).log)
     await store.read(scene, 99.0)
     (answer,) = await replay([store], scene, times(15)[14:])
-    assert answer.event is Event.LOST
+    assert answer.scene_status is SceneStatus.LOST
 
 
 async def test_something_else_in_the_events_place(redis_server: Process, store: RedisStore) -> None:
@@ -309,7 +327,7 @@ async def test_something_else_in_the_events_place(redis_server: Process, store: 
 async def test_bytes_an_agent(redis_server: Process, store: RedisStore, step: float, most: int) -> None:
     scene, agents = scene_name(), 32
     for t in times(round(15 / step), step):
-        await store.exchange(scene, t, [sighting(t, f"agent-{n}", off=9.0 * n) for n in range(agents)])
+        await store.exchange(scene, t, [track_update(t, f"agent-{n}", off=9.0 * n) for n in range(agents)])
     size = number(redis_server, "memory", "usage", SceneKeys(scene).log, "samples", "0")
     assert size / agents < most
 
@@ -317,26 +335,28 @@ async def test_bytes_an_agent(redis_server: Process, store: RedisStore, step: fl
 async def test_scenes_that_do_not_fit_are_read_again(redis_server: Process) -> None:
     async with opened(redis_server.url, max_agents=4) as store:
         scenes = [scene_name() for _ in range(5)]
-        answers: dict[str, list[Recalled]] = {scene: [] for scene in scenes}
+        answers: dict[str, list[ExchangeResult]] = {scene: [] for scene in scenes}
         for t in times(14):
             for scene in scenes:
                 answers[scene] += await replay([store], scene, [t])
             assert sum(len(each.memory) for each in store._scenes.values()) <= 4
         for scene in scenes:
-            assert [answer.event for answer in answers[scene]] == [Event.BEGUN] + [Event.KEPT] * 13
+            assert [answer.scene_status for answer in answers[scene]] == [SceneStatus.NEW] + [
+                SceneStatus.KEPT
+            ] * 13
             assert rows(answers[scene]) == rows(await replay([memory()], scene, times(14)))
 
 
 async def test_a_cancelled_call_leaves_no_trouble(store: RedisStore) -> None:
     scene = scene_name()
     rng = random.Random(5)
-    answers: list[Recalled] = []
+    answers: list[ExchangeResult] = []
     for t in times(40):
-        calls = [asyncio.create_task(store.exchange(scene, t, [sighting(t)])) for _ in range(3)]
+        calls = [asyncio.create_task(store.exchange(scene, t, [track_update(t)])) for _ in range(3)]
         await asyncio.sleep(rng.uniform(0, 0.0015))
         calls[1].cancel()
         done = await asyncio.gather(*calls, return_exceptions=True)
-        answers += [one for one in done if isinstance(one, Recalled)]
-        assert all(isinstance(one, Recalled) for one in (done[0], done[2]))
+        answers += [one for one in done if isinstance(one, ExchangeResult)]
+        assert all(isinstance(one, ExchangeResult) for one in (done[0], done[2]))
     settled = rows(answers)
     assert len(settled) == len(set(settled)) == 28

@@ -1,14 +1,14 @@
-"""Sightings to feed a memory with: an agent on a straight line, and forecasts that miss by a known offset."""
+"""Updates to feed a memory with: an agent on a straight line, and forecasts that miss by a known offset."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
 from model.arrays import Floats
-from service.tracking.store.base import Sighting
+from service.tracking.store.base import TrackUpdate
 from service.tracking.store.records import BLOCK, FORECAST_BLOCKS, OBSERVATION_FIELDS
 
-SERIES = "cab@1.0.0"
+MODEL = "cab@1.0.0"
 START = 1.6e9
 """s."""
 
@@ -32,24 +32,24 @@ def where(time: float, speed: float = 10.0, off: float = 0.0) -> tuple[float, fl
     return speed * (time - START), off
 
 
-def sighting(
+def track_update(
     time: float,
     agent_id: str = "a",
     *,
-    series: str = SERIES,
-    kind: bytes = b"v",
+    model: str = MODEL,
+    agent_type: bytes = b"v",
     speed: float = 10.0,
     off: float = 0.0,
     miss: float = 0.0,
     steps: int = 12,
-) -> Sighting:
+) -> TrackUpdate:
     """An agent seen and forecast at a time.
 
     Args:
         time: s.
         agent_id: its id.
-        series: of the forecast; empty: there is none.
-        kind: of agent.
+        model: model of the forecast; empty: no forecast.
+        agent_type: type of the agent.
         speed: m/s, along x.
         off: m, its y.
         miss: m that the forecast is beside the path, in y.
@@ -57,9 +57,9 @@ def sighting(
     """
     path = np.array([where(time + 0.5 * k, speed, off) for k in range(steps + 1)])
     path[1:, 1] += miss
-    made = forecast(path) if series else b""
+    made = forecast(path) if model else b""
     at = where(time, speed, off)
-    return Sighting(agent_id, kind, observation(time, at), series, made, steps if series else 0)
+    return TrackUpdate(agent_id, agent_type, observation(time, at), model, made, steps if model else 0)
 
 
 def times(count: int, step: float = 0.5, first: float = START) -> Sequence[float]:
