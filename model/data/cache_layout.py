@@ -1,8 +1,9 @@
-"""What a cache of pairs consists of, and how one tells whether it is the right one."""
+"""Layout of a cache of pairs, and the settings and the version that decide whether it is valid."""
 
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from model.data.checks import FUTURE_STEPS
@@ -17,11 +18,18 @@ from model.scenes.raster import PATCH_SIZE
 from model.scenes.scene import AgentType
 
 FORMAT_VERSION = 3
-"""Version of the folder's layout and of how its arrays are derived from the data: whoever changes either
-(resampling, features, sensing) raises it, and caches of other versions are built anew."""
+"""Version of the folder's layout and of the derivation of its arrays.
+
+A cache is valid if it has this version and the same key. So the version must be raised with every change that
+alters what a cache holds: the layout, readers, resampling, features, sensing, packing. Caches of other
+versions are then rebuilt. Made-up scenes have a version of their own (``synthetic.VERSION``), in the key.
+"""
 MANIFEST_FILE = "manifest.json"
 RASTERS_FILE = "rasters.u8"
 
+Array: TypeAlias = NDArray[Any]
+Arrays: TypeAlias = dict[str, Array]
+"""Arrays by name."""
 Layout: TypeAlias = dict[str, tuple[type[np.generic], tuple[int, ...]]]
 """Type and shape, without the first axis, of arrays by name."""
 
@@ -31,33 +39,33 @@ SCENE_LAYOUT: Layout = {
     "raster_origin": (np.float64, (2,)),
     "raster_pixels_per_meter": (np.float64, ()),
 }
-"""Arrays with a row per scene."""
+"""Arrays with one row per scene."""
 
 FILE_NAMES = {"neighbor_boxes": "surroundings"}
 """File names, without their ending, of arrays that were renamed in the code: older caches go on loading."""
 
 
 class CacheKey(BaseModel):
-    """What a cache is of."""
+    """Settings that determine what a cache holds."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     reader: str
-    """Class of the reader."""
+    """Name of the reader's class."""
     data: str = ""
-    """Where it reads: two data sets never share a cache by mistake."""
+    """Place of the data, so that two data sets never share a cache."""
     split: str
     protocol: Protocol
     history_frames: int = Field(ge=1)
     neighbor_types: tuple[AgentType, ...]
-    """Of the network's configuration; little else of it changes the arrays, so methods share caches."""
+    """Types in the network's configuration; little else of it changes the arrays, so methods share caches."""
     drawn: bool = False
-    """Whether neighbours are held as boxes to be drawn (CoverNet) instead of as summed histories."""
+    """Whether neighbours are held as boxes to be drawn (CoverNet) instead of summed histories."""
     agent_frame: bool = False
-    """Whether features are in the agents' own frames; such caches hold map patches and neighbours one by
-    one, whatever of them a network takes."""
+    """Whether features are in the agents' own frames. Such caches hold map patches and single neighbours,
+    whether or not a network uses them."""
     variants: int = Field(default=0, ge=0)
-    """V, how many noisy reports of each pair (``model.data.sensing``) are held beside the recorded states."""
+    """V, number of noisy reports of each pair (``model.data.sensing``) beside the recorded states."""
 
     @classmethod
     def of(
@@ -69,7 +77,7 @@ class CacheKey(BaseModel):
         history_frames: int,
         variants: int = 0,
     ) -> "CacheKey":
-        """Return the key of the cache that ``build_cache`` makes of the same arguments."""
+        """Return the key of the cache that ``build_cache`` makes from the same arguments."""
         own_frame = in_agent_frame(config)
         return cls(
             reader=type(reader).__name__,
@@ -85,26 +93,26 @@ class CacheKey(BaseModel):
 
     @property
     def summed_types(self) -> tuple[AgentType, ...]:
-        """Types whose summed histories are held."""
+        """Types of neighbours whose summed histories are held."""
         return () if self.drawn or self.agent_frame else self.neighbor_types
 
 
 class Manifest(BaseModel):
-    """What manifest.json holds."""
+    """Content of manifest.json."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     format_version: int
     key: CacheKey
     pairs: int = Field(ge=1)
-    """Rows: each pair has one, and after it one for each of its variants."""
+    """Number of rows: each pair has one, followed by one for each of its variants."""
     scenes: tuple[str, ...]
-    """Names; the array ``scene`` counts them."""
+    """Names of the scenes; the array ``scene`` has indices into them."""
     raster_bytes: int = Field(ge=1)
 
 
 def pair_layout(key: CacheKey) -> Layout:
-    """Arrays with a row per pair. ``token`` is a byte string of any length."""
+    """Return the layout of the arrays with one row per pair. ``token`` is a byte string of any length."""
     frames = key.history_frames
     layout: Layout = {
         "history": (np.float32, (frames, STATE_SIZE[AgentType.VEHICLE])),
@@ -135,15 +143,15 @@ def pair_layout(key: CacheKey) -> Layout:
 
 
 def in_agent_frame(config: AnyNetworkConfig) -> bool:
-    """Whether a network's features are in the agents' own frames."""
+    """Return whether a network's features are in the agents' own frames."""
     return isinstance(config, NetworkConfig) and config.frame is Frame.AGENT
 
 
 def draws(config: AnyNetworkConfig) -> bool:
-    """Whether the network looks at its neighbours as boxes in a picture."""
+    """Return whether a network sees its neighbours as boxes in a picture."""
     return isinstance(config, CoverNetConfig) and bool(config.neighbor_types)
 
 
 def neighbors_name(kind: AgentType) -> str:
-    """Name of the summed histories of neighbours of a type, in caches as in features."""
+    """Return the name of the summed histories of neighbours of a type, in caches and features."""
     return f"neighbors.{kind.value}"

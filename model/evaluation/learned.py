@@ -6,8 +6,8 @@ from pathlib import Path
 
 import torch
 
+from model.data.cache_builder import open_cache
 from model.data.cache_layout import CacheKey, in_agent_frame
-from model.data.caches import open_cache
 from model.data.checks import FUTURE_STEPS
 from model.data.scenes import Reader
 from model.evaluation.ablation import Without, ablations

@@ -1,4 +1,4 @@
-"""Model cards: what a checkpoint was trained on, how far, and how good it is there."""
+"""Model cards: data, training, calibration and figures of a checkpoint."""
 
 from dataclasses import dataclass
 
@@ -13,17 +13,17 @@ LICENSE = "trained on nuScenes: non-commercial use only (CC BY-NC-SA 4.0 and the
 
 @dataclass(frozen=True)
 class Origin:
-    """Where a checkpoint comes from."""
+    """Provenance of a checkpoint."""
 
     data: str
-    """The data set and its pairs, in words."""
+    """Data set and number of pairs, in words."""
     protocol: Protocol
     reported: str
-    """The split that the figures are of, in words, and how many pairs it has, in brackets."""
+    """Split of the figures, in words, with its number of pairs in brackets."""
     chosen_on: str
-    """The split that the epoch was chosen on, and that a calibration by horizon was fitted to."""
+    """Split on which the epoch was chosen and a calibration by horizon was fitted."""
     command: str
-    """That makes it, without the paths of the machine that did."""
+    """Command that repeats the run, without paths of the machine."""
     machine: str
 
 
@@ -35,15 +35,15 @@ def model_card(
     figures: dict[str, float],
     calibration: AnyCalibration | None,
 ) -> str:
-    """Markdown.
+    """Return the model card, in Markdown.
 
     Args:
-        config: of the run.
-        origin: of the data and the run.
-        progress: where the run stands; the checkpoint is its best epoch.
-        version: of the checkpoint.
-        figures: of the best epoch by name.
-        calibration: that was fitted after training; None: none was.
+        config: settings of the run.
+        origin: provenance of the checkpoint.
+        progress: progress of the run; the checkpoint is its best epoch.
+        version: version of the checkpoint.
+        figures: figures of the best epoch by name.
+        calibration: calibration that was fitted after training; None: there is none.
     """
     inputs = {
         Protocol.CAUSAL: "causal: states from the past alone, as a live service has them",
@@ -84,7 +84,7 @@ On {origin.reported}, {origin.protocol.value} protocol. {_choice(config, origin)
 
 
 def _network(config: TrainingConfig) -> str:
-    """Return what is not as in the published network; nothing where all is."""
+    """Return the differences from the published network; empty if there are none."""
     network = config.network
     if not (isinstance(network, NetworkConfig) and config.in_agent_frame):
         return ""
@@ -113,7 +113,7 @@ def _choice(config: TrainingConfig, origin: Origin) -> str:
 
 
 RAN_AWAY = "a number ran to the bound of its search: the likelihood asks for more of it than is reasonable"
-"""Said of such a calibration, on the card and while training."""
+"""Warning about such a calibration, on the card and while training."""
 
 
 def _calibration(calibration: AnyCalibration | None, origin: Origin) -> str:

@@ -1,4 +1,4 @@
-"""How CoverNet learns (Phan-Minh et al. 2020, section 3.3)."""
+"""Training of CoverNet (Phan-Minh et al. 2020, section 3.3)."""
 
 from collections.abc import Sequence
 
@@ -12,29 +12,29 @@ from model.networks.forecaster import CoverNetworks
 from model.scenes.scene import AgentType
 from model.training.config import TrainingConfig, TrainingError
 from model.training.learner import Batch, DescentLearner
-from model.training.objectives import Weights
-from model.training.trajectory_set import make_cover, summed_distances
+from model.training.objectives import LossWeights
+from model.training.trajectory_set import make_trajectory_set, summed_distances
 
 _TOP = 5
 
 
 class CoverNetLearner(DescentLearner):
-    """Cross-entropy with the member of the set that is nearest to the truth, by the mean distance.
+    """CoverNet under the cross-entropy with the member nearest to the truth, by the mean distance.
 
-    A wrong member costs the same whether it is near the truth or far from it. The run's
-    ``displacement_weight`` adds the distance from the truth that the probabilities expect, as for the other
-    methods; the published objective has none.
+    In the cross-entropy a wrong member costs the same whether it is near the truth or far from it. The
+    setting ``displacement_weight`` adds the expected distance from the truth, as for the other methods; the
+    published objective has no such term.
 
-    The set is made of all training trajectories; it is part of the network. A run that is resumed makes it
-    anew, and it is the same.
+    The set is made from all training trajectories and is part of the network. A resumed run makes it again,
+    with the same result.
 
     Args:
-        config: of the run.
+        config: settings of the run.
         paths: [P, T, 2], m, the training trajectories in the agents' own frames.
-        device: of the network.
+        device: device of the network.
 
     Raises:
-        TrainingError: the trajectories have not as many steps as the network's.
+        TrainingError: the trajectories and the network differ in their number of steps.
     """
 
     def __init__(self, config: TrainingConfig, paths: Tensor, device: torch.device) -> None:
@@ -42,16 +42,16 @@ class CoverNetLearner(DescentLearner):
         assert isinstance(shape, CoverNetConfig)  # noqa: S101 (for the type checker; the method's)
         if paths.shape[1] != shape.steps:
             raise TrainingError(f"the trajectories have {paths.shape[1]} steps, the network {shape.steps}")
-        cover = make_cover(paths, shape.epsilon)
-        count = len(cover.members)
+        trajectories = make_trajectory_set(paths, shape.epsilon)
+        count = len(trajectories.members)
         known = shape.model_copy(update={"members": count, "modes": min(count, shape.modes)})
         networks = CoverNetworks(known)
         self.network = networks.of(AgentType.VEHICLE)
-        self.network.cover.copy_(cover.members)
-        self.network.variance.copy_(cover.variance)
+        self.network.cover.copy_(trajectories.members)
+        self.network.variance.copy_(trajectories.variance)
         super().__init__(config, networks.to(device))
 
-    def step(self, batches: Sequence[Batch], weights: Weights, rate: float) -> dict[str, Tensor]:
+    def step(self, batches: Sequence[Batch], weights: LossWeights, rate: float) -> dict[str, Tensor]:
         (batch,) = batches
         with torch.no_grad():
             path = turned(batch.future, -present_heading(batch.features))
@@ -59,7 +59,7 @@ class CoverNetLearner(DescentLearner):
             nearest = distances.argmin(dim=1)
         scores = self.network.scores(batch.features)
         loss = F.cross_entropy(scores, nearest)
-        terms = _shares_right(scores.detach(), nearest)
+        terms = _accuracies(scores.detach(), nearest)
         if weights.displacement:
             displaced = (scores.softmax(dim=1) * distances).sum(dim=1).mean()
             loss = loss + weights.displacement * displaced
@@ -68,7 +68,7 @@ class CoverNetLearner(DescentLearner):
         return {"loss": loss.detach(), **terms}
 
 
-def _shares_right(scores: Tensor, nearest: Tensor) -> dict[str, Tensor]:
-    """How often the nearest member is the likeliest one, and among the likeliest five."""
+def _accuracies(scores: Tensor, nearest: Tensor) -> dict[str, Tensor]:
+    """Return how often the nearest member is the likeliest one, and among the likeliest five."""
     likeliest = scores.topk(min(_TOP, scores.shape[1]), dim=1).indices == nearest[:, None]
     return {"top_1": likeliest[:, 0].float().mean(), "top_5": likeliest.any(dim=1).float().mean()}

@@ -1,4 +1,4 @@
-"""HalentNet's discriminator: is a trajectory on this map a real one, and which latent made it?
+"""HalentNet's discriminator: tells real trajectories from generated ones, and which latent made them.
 
 Zhu et al., "HalentNet: Multimodal trajectory forecasting with hallucinative intents", ICLR 2021.
 """
@@ -16,28 +16,28 @@ BUMP_PIXELS = 5.0
 """Standard deviation of the bump that marks a position."""
 BUMP_PEAK = 9.0
 CHANNELS = 64
-"""Of the first layer; the i-th has i times as many."""
+"""Channels of the first layer; the i-th has i times as many."""
 LAYERS = 4
 _ROWS = 4
-"""Rows and columns of what the last convolution leaves of a patch."""
+"""Rows and columns of the last convolution's output."""
 
 
 class Verdict(NamedTuple):
-    """What the discriminator says."""
+    """Output of the discriminator."""
 
     real: Tensor
-    """[N]; 1: real, 0: made up."""
+    """[N]; 1: real, 0: generated."""
     latent_logits: Tensor
     """[N, K]."""
 
 
 class Discriminator(nn.Module):
-    """Four spectral-normalised convolutions over the map patch and a channel a future step.
+    """Four spectral-normalised convolutions over the map patch and one channel for each future step.
 
     Args:
-        steps: T, of the trajectories.
+        steps: T, steps of the trajectories.
         modes: K, latent categories.
-        dtype: of the convolutions; parameters and heads are float32.
+        dtype: precision of the convolutions; parameters and heads are float32.
     """
 
     def __init__(self, steps: int, modes: int, dtype: torch.dtype = torch.float32) -> None:
@@ -49,14 +49,14 @@ class Discriminator(nn.Module):
         self.real = nn.Linear(sizes[-1] * _ROWS**2, 1)
         self.latent = nn.Linear(sizes[-1] * _ROWS**2, modes)
         self._dtype = dtype
-        # On CPUs convolutions of many channels are three times as fast so
+        # On CPUs this makes convolutions of many channels three times as fast
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, patches: Tensor | None, paths: Tensor) -> Verdict:
-        """Judges trajectories.
+        """Return the verdict on trajectories.
 
         Args:
-            patches: [N, 3, 100, 100] in [-1, 1]; None: no map, zeros in its place.
+            patches: [N, 3, 100, 100] in [-1, 1]; None: zeros in place of a map.
             paths: [N, T, 2], m, in the agent's frame: ahead, to the left.
         """
         marks = draw(paths, self._dtype)
@@ -74,11 +74,11 @@ class Discriminator(nn.Module):
 
 
 def draw(paths: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
-    """A Gaussian bump at each position, in the patch's frame: [N, T, 100, 100]; differentiable.
+    """Return a Gaussian bump at each position, in the patch's frame: [N, T, 100, 100]; differentiable.
 
     Args:
         paths: [N, T, 2], m, ahead and to the left of the agent.
-        dtype: of the result.
+        dtype: type of the result.
     """
     pixels = torch.arange(PATCH_SIZE, dtype=paths.dtype, device=paths.device)
     place = paths * PATCH_PIXELS_PER_METER

@@ -1,7 +1,7 @@
-"""The terms of a conditional variational autoencoder's objective, in one context.
+"""Terms of the evidence lower bound (ELBO) of a conditional variational autoencoder, in one context.
 
-Trajectron++ (Salzmann et al. 2020), section 4.4: the evidence lower bound with a mutual-information term
-(InfoVAE, Zhao et al. 2019).
+Trajectron++ (Salzmann et al. 2020, section 4.4) adds a mutual-information term to it (InfoVAE, Zhao et al.
+2019).
 """
 
 from typing import NamedTuple
@@ -15,12 +15,12 @@ from model.forecaster import Context, Features
 from model.mixture import guarded_log_density
 from model.networks.network import AgentNetwork
 
-LEAST_KL = 0.07
-"""nats; below it the divergence is not pressed further."""
+MIN_KL = 0.07
+"""nats, lower clamp of the divergence (free bits)."""
 
 
 class ContextTerms(NamedTuple):
-    """What one context contributes, before weights."""
+    """Unweighted terms of one context."""
 
     prior_logits: Tensor
     """[N, K], of p(z | x), clipped."""
@@ -51,7 +51,7 @@ def context_terms(
     detach_encoding: bool = False,
     sample_controls: bool = True,
 ) -> ContextTerms:
-    """Runs one context of the network in training.
+    """Return the terms of one context.
 
     Args:
         network: in training mode for dropout.
@@ -75,7 +75,7 @@ def context_terms(
 
 
 def expected_displacement(log_prior: Tensor, displacement: Tensor) -> Tensor:
-    """Distance from the modes to the truth, expected under the prior and summed over the steps: [N], m.
+    """Return the distance from the truth, expected under the prior, summed over the steps: [N], m.
 
     Args:
         log_prior: [N, K], log p(z | x).
@@ -85,39 +85,39 @@ def expected_displacement(log_prior: Tensor, displacement: Tensor) -> Tensor:
 
 
 def log_likelihood(
-    log_weights: Tensor, step_density: Tensor, least: float | None, most: float | None
+    log_weights: Tensor, step_density: Tensor, lower: float | None, upper: float | None
 ) -> Tensor:
-    """log p(y | x) with the modes weighted at every step, each step clamped, summed over the steps: [N].
+    """Return log p(y | x), modes weighted at each step, each step clamped, summed over the steps: [N], nats.
 
     Args:
-        log_weights: [N, K]; in training those of q(z | x, y).
+        log_weights: [N, K], log-probabilities of the modes; in training those of q(z | x, y).
         step_density: [N, K, T].
-        least: bound of a step's log-likelihood from below; None: none.
-        most: from above.
+        lower: minimum of a step's log-likelihood; None: no clamp.
+        upper: maximum; None: no clamp.
     """
     steps = torch.logsumexp(log_weights[:, :, None] + step_density, dim=1)
-    if least is not None or most is not None:
-        steps = steps.clamp(least, most)
+    if lower is not None or upper is not None:
+        steps = steps.clamp(lower, upper)
     return steps.sum(dim=-1)
 
 
 def divergence(log_q: Tensor, log_p: Tensor) -> Tensor:
-    """KL(q ‖ p), averaged over the batch: [].
+    """Return KL(q ‖ p), averaged over the batch: [], nats.
 
     Args:
-        log_q: [N, K].
-        log_p: [N, K].
+        log_q: [N, K], log-probabilities.
+        log_p: [N, K], log-probabilities.
     """
     return F.kl_div(log_p, log_q, reduction="batchmean", log_target=True)
 
 
 def clamped_divergence(log_q: Tensor, log_p: Tensor) -> Tensor:
-    """KL(q ‖ p), averaged over the batch and then bounded from below (free bits)."""
-    return divergence(log_q, log_p).clamp_min(LEAST_KL)
+    """Return KL(q ‖ p), averaged over the batch and then clamped from below (free bits): [], nats."""
+    return divergence(log_q, log_p).clamp_min(MIN_KL)
 
 
 def mutual_information(log_prior: Tensor) -> Tensor:
-    """I(z; x) under the prior: entropy of the batch-mean p(z | x) minus the mean entropy: []."""
+    """Return I(z; x) under the prior: entropy of the batch-mean p(z | x) minus the mean entropy: [], nats."""
     prior = log_prior.exp()
     mean = prior.mean(dim=0)
     return -torch.xlogy(mean, mean).sum() + (prior * log_prior).sum(dim=-1).mean()

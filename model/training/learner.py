@@ -1,4 +1,4 @@
-"""What a training step changes: networks and their optimisers, whichever the method."""
+"""Learners: networks, their optimisers, and what one training step does to them."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -7,27 +7,25 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from model.data.hiding import hide_context
-from model.data.holdups import block
-from model.data.jittering import jitter
 from model.data.packing import unpack_patches
+from model.data.perturbation import drop_context, insert_stopped_vehicles, jitter
 from model.forecaster import Features
 from model.networks.agent_frame import AgentFrameNetwork
 from model.networks.config import NetworkConfig
 from model.networks.covernet import turned
+from model.networks.decoder import ModeDecoder
+from model.networks.encoders import MapEncoder
 from model.networks.forecaster import CvaeNetworks, Networks
 from model.networks.network import AgentNetwork
 from model.scenes.scene import AgentType
-from model.training.config import Method, TrainingConfig
-from model.training.dropout import scale_dropout
+from model.training.config import Method, Precision, TrainingConfig
 from model.training.mixture_objective import mixture_objective
-from model.training.objectives import OBJECTIVES, Loss, Weights
-from model.training.precision import set_precision
+from model.training.objectives import OBJECTIVES, Loss, LossWeights
 from model.training.processes import average_gradients
 
 
 class Batch(NamedTuple):
-    """Pairs, ready for a network."""
+    """Pairs as a network takes them."""
 
     features: Features
     future: Tensor
@@ -35,10 +33,10 @@ class Batch(NamedTuple):
 
 
 class Learner(ABC):
-    """Networks that learn.
+    """Networks in training.
 
-    ``networks`` are those that forecast: they are judged and shipped. A method may have others, which
-    matter to the training only.
+    ``networks`` are those that forecast, which are evaluated and shipped; ``others`` are used
+    in training only.
     """
 
     def __init__(self, networks: Networks[Any]) -> None:
@@ -51,21 +49,21 @@ class Learner(ABC):
 
     @property
     def others(self) -> Mapping[str, nn.Module]:
-        """Networks of the training only, by name."""
+        """Networks used in training only, by name."""
         return {}
 
     @property
     @abstractmethod
     def optimizers(self) -> Mapping[str, torch.optim.Optimizer]:
-        """By name; each of parameters of ``networks`` or ``others``."""
+        """Optimisers by name; each has parameters of ``networks`` or ``others``."""
 
     @abstractmethod
-    def step(self, batches: Sequence[Batch], weights: Weights, rate: float) -> dict[str, Tensor]:
-        """One step.
+    def step(self, batches: Sequence[Batch], weights: LossWeights, rate: float) -> dict[str, Tensor]:
+        """Do one training step.
 
         Args:
-            batches: of ``batch_sizes``, or of a process's share of them.
-            weights: of the losses' terms at this step.
+            batches: batches of ``batch_sizes``, or of this process's share of them.
+            weights: weights of the losses' terms at this step.
             rate: the learning rate.
 
         Returns:
@@ -73,16 +71,16 @@ class Learner(ABC):
         """
 
     def modules(self) -> dict[str, nn.Module]:
-        """All networks by name."""
+        """Return all networks by name."""
         return {"network": self.networks, **self.others}
 
 
 class DescentLearner(Learner):
-    """Networks with one optimiser of all their parameters.
+    """Networks with one optimiser (AdamW) for all their parameters.
 
     Args:
-        config: of the run.
-        networks: that learn, on their device.
+        config: settings of the run.
+        networks: the networks, on their device.
     """
 
     def __init__(self, config: TrainingConfig, networks: Networks[Any]) -> None:
@@ -104,7 +102,7 @@ class DescentLearner(Learner):
         return {"optimizer": self.optimizer}
 
     def descend(self, loss: Tensor, rate: float) -> None:
-        """A step of the optimiser against a loss."""
+        """Do one optimiser step on a loss."""
         for group in self.optimizer.param_groups:
             group["lr"] = rate * group.get("rate_factor", 1.0)
         self.optimizer.zero_grad(set_to_none=True)
@@ -114,16 +112,16 @@ class DescentLearner(Learner):
         self.optimizer.step()
 
     def _groups(self) -> list[dict[str, object]]:
-        """Parameters for the optimiser; ``rate_factor`` of a group multiplies its learning rate."""
+        """Return the optimiser's parameter groups; ``rate_factor`` multiplies a group's learning rate."""
         return [{"params": list(self.networks.parameters())}]
 
 
 class CvaeLearner(DescentLearner):
-    """A CVAE under one of the objectives.
+    """A CVAE under its method's objective (``model.training.objectives``).
 
     Args:
-        config: of the run.
-        device: of the networks.
+        config: settings of the run.
+        device: device of the networks.
     """
 
     def __init__(self, config: TrainingConfig, device: torch.device) -> None:
@@ -135,7 +133,7 @@ class CvaeLearner(DescentLearner):
         self.network = network
         self._objective = OBJECTIVES[config.method.value]
 
-    def step(self, batches: Sequence[Batch], weights: Weights, rate: float) -> dict[str, Tensor]:
+    def step(self, batches: Sequence[Batch], weights: LossWeights, rate: float) -> dict[str, Tensor]:
         (batch,) = batches
         loss = self._objective(self.network, batch.features, batch.future, weights)
         self.descend(loss.value, rate)
@@ -143,11 +141,11 @@ class CvaeLearner(DescentLearner):
 
 
 class AgentFrameLearner(DescentLearner):
-    """A network of the agent's frame under the mixture's objective.
+    """A network of the agent's frame under the mixture objective (``model.training.mixture_objective``).
 
     Args:
-        config: of the run.
-        device: of the networks.
+        config: settings of the run.
+        device: device of the networks.
     """
 
     def __init__(self, config: TrainingConfig, device: torch.device) -> None:
@@ -157,26 +155,47 @@ class AgentFrameLearner(DescentLearner):
         network = networks.of(AgentType.VEHICLE)
         assert isinstance(network, AgentFrameNetwork)  # noqa: S101 (likewise)
         self.network = network
-        self._weights = config.mixture
-        self._contrast = config.method is Method.CAB
-        self._hide = config.hide
-        self._block = config.block
-        self._jitter = config.jitter
+        self._config = config
 
-    def step(self, batches: Sequence[Batch], weights: Weights, rate: float) -> dict[str, Tensor]:
+    def step(self, batches: Sequence[Batch], weights: LossWeights, rate: float) -> dict[str, Tensor]:
         (batch,) = batches
-        future = turned(batch.future, -batch.features["heading"].to(batch.future.dtype))
-        features = block(batch.features, future) if self._block else batch.features
-        features = dict(hide_context(features) if self._hide else features)
-        for name in features.keys() & {"map", "far_map"}:
-            features[name] = unpack_patches(features[name])
-        if self._jitter:
-            features, future = jitter(features, future)
-        loss = mixture_objective(self.network, features, future, self._weights, self._contrast)
+        features, future = self._perturbed(batch)
+        contrast = self._config.method is Method.CAB
+        loss = mixture_objective(self.network, features, future, self._config.mixture, contrast)
         self.descend(loss.value, rate)
         return logged(loss)
 
+    def _perturbed(self, batch: Batch) -> tuple[Features, Tensor]:
+        """Return perturbed features, maps unpacked, and the future in the agents' frames."""
+        config = self._config
+        future = turned(batch.future, -batch.features["heading"].to(batch.future.dtype))
+        features = batch.features
+        if config.stopped_vehicles:
+            features = insert_stopped_vehicles(features, future)
+        features = dict(drop_context(features) if config.context_dropout else features)
+        for name in features.keys() & {"map", "far_map"}:
+            features[name] = unpack_patches(features[name])
+        return jitter(features, future) if config.jitter else (features, future)
+
 
 def logged(loss: Loss) -> dict[str, Tensor]:
-    """A loss and its terms for the log."""
+    """Return a loss and its terms for the log."""
     return {"loss": loss.value.detach()} | {name: term.detach() for name, term in loss.terms.items()}
+
+
+def set_precision(networks: nn.Module, precision: Precision) -> None:
+    """Set the training precision of every decoder and map encoder."""
+    for module in networks.modules():
+        if isinstance(module, ModeDecoder | MapEncoder):
+            module.training_dtype = precision.dtype
+
+
+def scale_dropout(networks: nn.Module, factor: float) -> None:
+    """Multiply the rate of every dropout layer (Srivastava et al. 2014); 0 turns dropout off.
+
+    The published rates (0.25 on the recurrent encodings, 0.5 on the map's) suit networks that would otherwise
+    overfit their training set.
+    """
+    for module in networks.modules():
+        if isinstance(module, nn.Dropout):
+            module.p *= factor

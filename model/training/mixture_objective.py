@@ -1,10 +1,10 @@
-"""The objective of networks in the agent's frame: modes that differ, and weights that mean something.
+"""Objective of networks in the agent's frame: a mixture whose modes differ and whose weights are meaningful.
 
-It joins what measurements asked for (``docs/experiments.md``): the likelihood of the mixture with the weights
-p(z | x) themselves, a pull of the nearest mode towards the truth (multiple choice learning; Guzman-Rivera et
-al. 2012, as in MTP and MultiPath), the probability of the nearest modes, and the distance from the truth that
-is expected under the probabilities, which asks that the likeliest be near. CAB adds the same terms of its
-blind forecast, and the divergence of full and blind latents (Ben-Younes et al. 2022, section 3.3).
+Its terms were chosen by experiment (``docs/experiments.md``): the likelihood of the mixture with weights
+p(z | x), the distance of the nearest mode (winner takes all: multiple choice learning, Guzman-Rivera et al.
+2012, as in MTP and MultiPath), the classification of the nearest modes, and the distance from the truth
+expected under the probabilities, which makes the likeliest mode a near one. CAB adds the same terms for its
+blind forecast and its KL term, ``objectives.cab_kl`` (Ben-Younes et al. 2022, section 3.3).
 """
 
 import math
@@ -12,57 +12,19 @@ from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
-from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
 from model.features.agent_features import NEIGHBOR_VELOCITY_SCALE
 from model.forecaster import Context, Features
 from model.networks.agent_frame import AgentFrameNetwork, Modes, Path, drives_through, read_patch
 from model.scenes.raster import FAR
-from model.training.elbo import divergence
-from model.training.objectives import Loss
+from model.training.config import MixtureWeights
+from model.training.objectives import Loss, cab_kl
 
 _LEFT = 0.2
-"""A neighbour that the truth goes through more nearly than that did not stay where it was."""
+"""A neighbour has left if the true path overlaps its place by more than this (``drives_through``)."""
 _STANDING_MPS = 0.5
-"""A neighbour that is slower stands."""
-
-
-class MixtureWeights(BaseModel):
-    """Weights of the objective's terms."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    likelihood: float = Field(default=1.0, ge=0)
-    """Of the negative log-likelihood of a step, nats, mean over the steps."""
-    joint_likelihood: float = Field(default=0.0, ge=0)
-    """Of that of the whole trajectory, nats a step."""
-    nearest: float = Field(default=1.0, ge=0)
-    """1/m, of the mean distance of the nearest mode."""
-    nearest_of_5: float = Field(default=0.0, ge=0)
-    """Likewise of the nearest of the five likeliest: those are what a planner and the devkit look at."""
-    nearest_of_10: float = Field(default=0.0, ge=0)
-    """Likewise of the ten likeliest."""
-    likeliest: float = Field(default=0.0, ge=0)
-    """1/m, of the mean distance of the likeliest mode; its probability has no part in this."""
-    choice: float = Field(default=0.0, ge=0)
-    """Of the cross-entropy of p(z | x) with modes chosen by their distances."""
-    choice_range_m: float = Field(default=1.0, gt=0)
-    """m; modes count as chosen by exp(−distance / range)."""
-    expected: float = Field(default=1.0, ge=0)
-    """1/m, of the mean distance expected under p(z | x)."""
-    off_road: float = Field(default=0.0, ge=0)
-    """Weight of leaving the road at any step: of the probability of the modes that do."""
-    collision: float = Field(default=0.0, ge=0)
-    """Weight of driving through a neighbour that stands: of the probability of the modes that do."""
-    proposal: float = Field(default=0.5, ge=0)
-    """Of the distances of the proposals, beside those of the refined modes."""
-    blind: float = Field(default=1.0, ge=0)
-    """Of all terms of the blind forecast (CAB's λ)."""
-    blind_share: float = Field(default=1.0, gt=0, le=1)
-    """Share of a batch that is also forecast blindly."""
-    apart: float = Field(default=0.1, ge=0)
-    """λ_KL of CAB: how much full and blind latents are pressed apart."""
+"""m/s; a slower neighbour stands."""
 
 
 class _Terms(NamedTuple):
@@ -75,14 +37,14 @@ class _Terms(NamedTuple):
 def mixture_objective(
     network: AgentFrameNetwork, features: Features, future: Tensor, weights: MixtureWeights, contrast: bool
 ) -> Loss:
-    """Return the loss.
+    """Return the loss of a batch.
 
     Args:
-        network: in training mode.
-        features: of N agents, full context.
+        network: the network, in training mode.
+        features: features of N agents, full context.
         future: [N, T, 2], m, in the agents' frames, relative to now.
-        weights: of the terms.
-        contrast: whether the blind forecast is trained, too, and pressed apart (CAB).
+        weights: weights of the terms.
+        contrast: whether to add CAB's terms: those of the blind forecast, and ``cab_kl``.
     """
     full = _terms(network, features, future, weights, Context.FULL)
     if not contrast:
@@ -90,14 +52,14 @@ def mixture_objective(
     some = slice(0, max(1, round(weights.blind_share * len(future))))
     part = {name: values[some] for name, values in features.items()}
     blind = _terms(network, part, future[some], weights, Context.BLIND)
-    apart = divergence(full.log_weights[some], blind.log_weights.detach())
-    value = full.value + weights.blind * blind.value - weights.apart * apart
+    kl = cab_kl(full.log_weights[some], blind.log_weights)
+    value = full.value + weights.blind * blind.value - weights.blind_kl * kl
     named = {
         f"{name}_{which}": term
         for which, one in (("full", full), ("blind", blind))
         for name, term in one.named.items()
     }
-    return Loss(value, named | {"kl_full_blind": apart.detach()})
+    return Loss(value, named | {"kl_full_blind": kl.detach()})
 
 
 def _terms(
@@ -109,36 +71,40 @@ def _terms(
     nll = -torch.logsumexp(log_weights[..., None] + density, dim=1).mean()
     distance, proposed = _distances(modes.path, future), _distances(modes.proposal, future)
     mean_distance = distance.mean(dim=-1)
-    # The end counts twice: modes that differ at the end only are still different ones
+    # The last step weighs more: modes that differ only there are different modes
     score = (mean_distance + 0.5 * distance[..., -1]).detach()
     nearest = score.argmin(dim=1, keepdim=True)
     pulled = mean_distance.gather(1, nearest).mean()
     ranked = log_weights.argsort(dim=1, descending=True)
     expected = (log_weights.exp() * mean_distance).sum(dim=1).mean()
-    value = weights.likelihood * nll + weights.nearest * pulled + weights.expected * expected
+    value = weights.nll * nll + weights.min_ade * pulled + weights.expected_ade * expected
     of_proposal = proposed.mean(dim=-1)
     value = value + weights.proposal * (
-        weights.nearest * of_proposal.gather(1, nearest).mean()
-        + weights.expected * (log_weights.exp().detach() * of_proposal).sum(dim=1).mean()
+        weights.min_ade * of_proposal.gather(1, nearest).mean()
+        + weights.expected_ade * (log_weights.exp().detach() * of_proposal).sum(dim=1).mean()
     )
     named = {"nll": nll, "nearest_m": pulled, "expected_m": expected}
-    for count, weight in ((1, weights.likeliest), (5, weights.nearest_of_5), (10, weights.nearest_of_10)):
+    for count, weight in (
+        (1, weights.most_likely_ade),
+        (5, weights.min_ade_5),
+        (10, weights.min_ade_10),
+    ):
         if weight:
             first = ranked[:, :count]
             chosen = first.gather(1, score.gather(1, first).argmin(dim=1, keepdim=True))
             distance_m = mean_distance.gather(1, chosen).mean()
             value = value + weight * distance_m
             named[f"nearest_of_{count}_m"] = distance_m
-    if weights.joint_likelihood:
+    if weights.joint_nll:
         steps = future.shape[1]
         joint = -torch.logsumexp(log_weights + density.sum(dim=-1), dim=1).mean() / steps
-        value = value + weights.joint_likelihood * joint
+        value = value + weights.joint_nll * joint
         named["joint_nll"] = joint
-    if weights.choice:
-        chosen = F.softmax(-score / weights.choice_range_m, dim=1)
-        choice = -(chosen * log_weights).sum(dim=1).mean()
-        value = value + weights.choice * choice
-        named["choice"] = choice
+    if weights.classification:
+        target = F.softmax(-score / weights.classification_range_m, dim=1)
+        classification = -(target * log_weights).sum(dim=1).mean()
+        value = value + weights.classification * classification
+        named["choice"] = classification
     if weights.off_road and context is Context.FULL and "far_map" in features:
         road = read_patch(features["far_map"], modes.path.x, modes.path.y, FAR)[:, 0]
         off = (log_weights.exp() * F.relu(-road).amax(dim=-1)).sum(dim=1).mean()
@@ -153,9 +119,9 @@ def _terms(
 
 
 def _meets_standing(path: Path, future: Tensor, neighbors: Tensor) -> Tensor:
-    """Return how nearly each mode drives through a neighbour that stands: [N, K], 0 to 1.
+    """Return by how much each mode drives through a standing neighbour: [N, K], 0 to 1.
 
-    Neighbours that the true path goes through do not count: they left.
+    Neighbours that the true path drives through do not count, as they have left.
     """
     x, y = future[:, None].unbind(-1)
     moved_x, moved_y = (torch.diff(part, prepend=torch.zeros_like(part[..., :1])) for part in (x, y))
@@ -169,7 +135,7 @@ def _meets_standing(path: Path, future: Tensor, neighbors: Tensor) -> Tensor:
 
 def step_log_density(network: AgentFrameNetwork, modes: Modes, future: Tensor) -> Tensor:
     """Return the log-density of the true position under each mode at each step: [N, K, T], 1/m² inside the
-    log, with the network's floor of the variances."""
+    log; the network's floor is added to the variances."""
     ahead, left = (future[:, None, :, axis] - part for axis, part in enumerate((modes.path.x, modes.path.y)))
     cos, sin = modes.path.heading.cos(), modes.path.heading.sin()
     along, across = cos * ahead + sin * left, cos * left - sin * ahead

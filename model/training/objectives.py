@@ -1,4 +1,8 @@
-"""The objectives of the methods; the network is one and the same (Ben-Younes et al. 2022, section 3)."""
+"""Objectives of the methods with a CVAE; all train the same network (Ben-Younes et al. 2022, section 3).
+
+CAB's KL term, the divergence of full and blind latents that it maximises, is ``cab_kl``. The objective
+``cab`` uses it in the ground frame, ``model.training.mixture_objective`` in the agent's frame.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,68 +25,81 @@ from model.training.elbo import (
 
 
 @dataclass(frozen=True)
-class Weights:
-    """What changes over the steps, and how the decoder is fed."""
+class LossWeights:
+    """Weights of the objectives' terms at one step, and how the decoder is fed."""
 
     kl: float
     logit_clip: float
     sample_controls: bool = True
-    least_step_likelihood: float = -6.0
-    """nats; in CAB, Reweight and RUBiZ a step's log-likelihood is clamped there from below. As released, −6:
-    what is forecast worse than that then has no gradient."""
+    min_step_likelihood: float = -6.0
+    """nats, lower clamp of a step's log-likelihood in CAB, Reweight and RUBiZ. As released, −6: a worse step
+    then has no gradient."""
     displacement: float = 0.0
-    """1/m, of ``elbo.expected_displacement``; 0, as released, leaves it out."""
-    apart: float = 5.0
-    """λ_KL of CAB: how much full and blind latents are pressed apart; as released, 5."""
+    """1/m, weight of ``elbo.expected_displacement``; 0, as released, leaves it out."""
+    blind_kl: float = 5.0
+    """λ_KL, weight of ``cab_kl``; as released, 5."""
 
 
 class Loss(NamedTuple):
-    """A loss and the terms that it is made of, for the log."""
+    """A loss and its terms for the log."""
 
     value: Tensor
     terms: dict[str, Tensor]
 
 
-Objective = Callable[[AgentNetwork, Features, Tensor, Weights], Loss]
+Objective = Callable[[AgentNetwork, Features, Tensor, LossWeights], Loss]
 """(network, features, future [N, T, 2] in m relative to now, weights) → loss."""
 
-MOST_STEP_LIKELIHOOD = 6.0
-"""nats; a step's log-likelihood is clamped there, so that standing agents do not take over the loss."""
+MAX_STEP_LIKELIHOOD = 6.0
+"""nats, upper clamp of a step's log-likelihood, so that standing agents do not dominate the loss."""
 RUBIZ_FULL = 0.1
-"""RUBiZ's weight of the full log-likelihood."""
+"""Weight of the full log-likelihood in RUBiZ."""
 
 
-def trajectron(network: AgentNetwork, features: Features, future: Tensor, weights: Weights) -> Loss:
-    """Trajectron++ (also without context: that is in the network's shape)."""
+def trajectron(network: AgentNetwork, features: Features, future: Tensor, weights: LossWeights) -> Loss:
+    """Return the loss of Trajectron++, with or without context (the network's configuration decides)."""
     full = _terms(network, features, future, Context.FULL, weights)
-    bound = _bound(full, weights, bounded=False)
+    bound = _bound(full, weights, clamped=False)
     return Loss(bound.value(), bound.named())
 
 
-def cab(network: AgentNetwork, features: Features, future: Tensor, weights: Weights) -> Loss:
-    """CAB: the same network on a null context, and full and blind latents pressed apart.
+def cab(network: AgentNetwork, features: Features, future: Tensor, weights: LossWeights) -> Loss:
+    """Return the loss of CAB: ELBOs with full and with null context, minus the weighted KL term ``cab_kl``.
 
     As released, the gradient stops at the blind encoding.
     """
-    full, blind = _both(network, features, future, weights)
+    full, blind = _full_and_blind(network, features, future, weights)
     bounds = [_bound(terms, weights) for terms in (full, blind)]
-    apart = divergence(full.log_prior, blind.log_prior.detach())
-    value = bounds[0].value() + bounds[1].value() - weights.apart * apart
-    return Loss(value, bounds[0].named("full") | bounds[1].named("blind") | {"kl_full_blind": apart})
+    kl = cab_kl(full.log_prior, blind.log_prior)
+    value = bounds[0].value() + bounds[1].value() - weights.blind_kl * kl
+    return Loss(value, bounds[0].named("full") | bounds[1].named("blind") | {"kl_full_blind": kl})
 
 
-def reweight(network: AgentNetwork, features: Features, future: Tensor, weights: Weights) -> Loss:
-    """Reweight: agents that the blind forecast misses count more."""
-    full, blind = _both(network, features, future, weights)
+def cab_kl(full_log_prior: Tensor, blind_log_prior: Tensor) -> Tensor:
+    """Return CAB's KL term, KL(p(z | x) ‖ p(z | blind x)), averaged over the batch: [], nats.
+
+    CAB maximises it, with weight λ_KL, so that the latents of the full context differ from those of the blind
+    forecast (Ben-Younes et al. 2022, section 3.3). No gradient reaches the blind latents.
+
+    Args:
+        full_log_prior: [N, K], log p(z | x) with full context.
+        blind_log_prior: [N, K], log p(z | blind x).
+    """
+    return divergence(full_log_prior, blind_log_prior.detach())
+
+
+def reweight(network: AgentNetwork, features: Features, future: Tensor, weights: LossWeights) -> Loss:
+    """Return the loss of Reweight: agents that the blind forecast misses weigh more."""
+    full, blind = _full_and_blind(network, features, future, weights)
     bounds = [_bound(terms, weights) for terms in (full, blind)]
     share = torch.sigmoid(-bounds[1].likelihood).detach()
     value = bounds[0].value() + bounds[1].value() - (share * bounds[0].likelihood).mean()
     return Loss(value, bounds[0].named("full") | bounds[1].named("blind") | {"share": share.mean()})
 
 
-def rubiz(network: AgentNetwork, features: Features, future: Tensor, weights: Weights) -> Loss:
-    """RUBiZ: the latents of both contexts, fused, must explain the future, too."""
-    full, blind = _both(network, features, future, weights)
+def rubiz(network: AgentNetwork, features: Features, future: Tensor, weights: LossWeights) -> Loss:
+    """Return the loss of RUBiZ: the fused latents of both contexts have to explain the future, too."""
+    full, blind = _full_and_blind(network, features, future, weights)
     fused = fused_terms(full, blind)
     bounds = {
         name: _bound(terms, weights) for name, terms in (("full", full), ("blind", blind), ("fused", fused))
@@ -94,9 +111,9 @@ def rubiz(network: AgentNetwork, features: Features, future: Tensor, weights: We
 
 
 def fused_terms(full: ContextTerms, blind: ContextTerms) -> ContextTerms:
-    """RUBiZ's latents, from both contexts; positions are the full one's.
+    """Return RUBiZ's fused latents of both contexts, with the positions of the full one.
 
-    Logits are σ(l)·σ(l̃), where, as released, l are normalised ones, log p(z | ·).
+    Logits are σ(l)·σ(l̃); as released, the l are normalised: log p(z | ·).
     """
     return ContextTerms(
         full.log_prior.sigmoid() * blind.log_prior.sigmoid(),
@@ -115,7 +132,7 @@ OBJECTIVES: dict[str, Objective] = {
     "halentnet": trajectron,
     "halentnet-no-context": trajectron,
 }
-"""By the method's name; of HalentNet, its CVAE step."""
+"""Objectives by the method's name; for HalentNet, that of its CVAE step."""
 
 
 class _Bound(NamedTuple):
@@ -127,15 +144,15 @@ class _Bound(NamedTuple):
     information: Tensor
     displacement: Tensor | None
     """m; None: it has no weight."""
-    weights: Weights
+    weights: LossWeights
 
     def value(self, likelihood_weight: float = 1.0) -> Tensor:
-        """What is minimised."""
+        """Return the negative bound, to be minimised."""
         value = -likelihood_weight * self.likelihood.mean() + self.weights.kl * self.kl - self.information
         return value if self.displacement is None else value + self.weights.displacement * self.displacement
 
     def named(self, context: str = "") -> dict[str, Tensor]:
-        """Its terms for the log."""
+        """Return the terms for the log."""
         suffix = f"_{context}" if context else ""
         terms = {"log_likelihood": self.likelihood.mean(), "kl": self.kl}
         terms["mutual_information"] = self.information
@@ -144,12 +161,12 @@ class _Bound(NamedTuple):
         return {name + suffix: term.detach() for name, term in terms.items()}
 
 
-def _bound(terms: ContextTerms, weights: Weights, bounded: bool = True) -> _Bound:
+def _bound(terms: ContextTerms, weights: LossWeights, clamped: bool = True) -> _Bound:
     log_prior, log_posterior = terms.log_prior, terms.log_posterior
-    least = weights.least_step_likelihood if bounded else None
+    lower = weights.min_step_likelihood if clamped else None
     displaced = expected_displacement(log_prior, terms.displacement).mean() if weights.displacement else None
     return _Bound(
-        log_likelihood(log_posterior, terms.step_density, least, MOST_STEP_LIKELIHOOD),
+        log_likelihood(log_posterior, terms.step_density, lower, MAX_STEP_LIKELIHOOD),
         clamped_divergence(log_posterior, log_prior),
         mutual_information(log_prior),
         displaced,
@@ -162,7 +179,7 @@ def _terms(
     features: Features,
     future: Tensor,
     context: Context,
-    weights: Weights,
+    weights: LossWeights,
     detach_encoding: bool = False,
 ) -> ContextTerms:
     return context_terms(
@@ -176,10 +193,10 @@ def _terms(
     )
 
 
-def _both(
-    network: AgentNetwork, features: Features, future: Tensor, weights: Weights
+def _full_and_blind(
+    network: AgentNetwork, features: Features, future: Tensor, weights: LossWeights
 ) -> tuple[ContextTerms, ContextTerms]:
-    """Full and blind terms; as released, no gradient reaches the encoder through the blind ones."""
+    """Return full and blind terms; as released, no gradient reaches the encoder through the blind ones."""
     full = _terms(network, features, future, Context.FULL, weights)
     blind = _terms(network, features, future, Context.BLIND, weights, detach_encoding=True)
     return full, blind

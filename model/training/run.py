@@ -1,6 +1,5 @@
-"""From recorded data to a checkpoint: what ``cab-forecast train`` does."""
+"""Training from recorded data to a checkpoint (``cab-forecast train``)."""
 
-import os
 import platform
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ import torch
 from model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from model.data.batches import Batches, JoinedPairs
 from model.data.cache import Cache
-from model.data.caches import open_cache
+from model.data.cache_builder import open_cache
 from model.data.scenes import Reader
 from model.data.sources import READERS
 from model.forecaster import ModelInfo, Protocol
@@ -27,21 +26,20 @@ from model.training.calibration import (
 )
 from model.training.card import LICENSE, RAN_AWAY, Origin, model_card
 from model.training.config import TrainingConfig
-from model.training.logs import RunLog
-from model.training.loop import Report, Trainer
-from model.training.source import BatchSource
-from model.training.state import Progress
+from model.training.loop import OnEpoch, Trainer
+from model.training.sampling import BatchSource
+from model.training.state import Progress, RunLog
 from model.training.validation import Validation
 
 SAMPLES = 200
-"""Trajectories a pair for the sampled figures of a card."""
+"""Trajectories drawn for each pair for the sampled figures of a card."""
 DRAWS = 200
-"""Of each mixture, for its calibration."""
+"""Positions drawn from each mixture for the calibration figures of a card."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """What to train on."""
+    """Data to train on."""
 
     kind: str
     path: Path
@@ -49,59 +47,59 @@ class Source:
     validation_split: str
     protocol: Protocol
     report_split: str | None = None
-    """The split that the card's figures are of; None: the validation split."""
+    """Split of the card's figures; None: the validation split."""
     also: tuple[tuple[str, Path, str], ...] = ()
-    """Kind, path and split of more pairs to train on."""
+    """More pairs to train on: kind, path and split."""
 
     def reader(self) -> Reader:
-        """Opens the data.
+        """Return the reader of the data.
 
         Raises:
-            DataError: it is not there.
+            DataError: the data is missing.
         """
         return READERS[self.kind](self.path)
 
 
 @dataclass(frozen=True)
 class Run:
-    """What is to be trained, on what, and where to."""
+    """A training run: settings, data and output."""
 
     config: TrainingConfig
     source: Source
     out: Path
-    """State, log, and at the end the checkpoint in ``checkpoint/``."""
+    """Folder of the run: state, log, and at the end the checkpoint in ``checkpoint/``."""
     cache: Path
-    """Folder of the caches; runs may share it."""
+    """Folder of the caches, which runs may share."""
     version: str
-    """Of the checkpoint."""
+    """Version of the checkpoint."""
     start: Checkpoint | None = None
-    """Whose parameters to begin with."""
+    """Checkpoint whose parameters the run begins with."""
 
     def train(
         self,
-        report: Report,
-        tick: Callable[[int, int, int], None],
-        said: Callable[[str], None],
+        on_epoch: OnEpoch,
+        on_step: Callable[[int, int, int], None],
+        on_message: Callable[[str], None],
     ) -> Path:
-        """Trains, resuming what is in ``out``, and writes the best epoch as a checkpoint.
+        """Train, resuming the run in ``out``, and write the best epoch as a checkpoint.
 
         Args:
-            report: told of each epoch, in the first process only.
-            tick: told of each step: epoch, batches done, batches in the epoch.
-            said: told in words what else goes on.
+            on_epoch: called after each epoch, in the first process only.
+            on_step: called after each step: (epoch, batches done, batches in the epoch).
+            on_message: called with a text about whatever else happens.
 
         Returns:
             The checkpoint's folder.
 
         Raises:
-            TrainingError: the run cannot be resumed.
+            TrainingError: the run cannot be resumed, or it has diverged.
             DataError: the data is bad.
         """
-        device = _device()
+        device = processes.local_device()
         first = processes.join(device)
-        train, judged, reported = processes.first_alone(lambda: self._open_caches(said))
+        train, validated, reported = processes.first_then_others(lambda: self._open_caches(on_message))
         network = self.config.network
-        validation = Validation(judged, network, device)
+        validation = Validation(validated, network, device)
         batches = JoinedPairs([Batches(cache, device, network, packed_maps=True) for cache in train])
         parameters = None if self.start is None else self.start.tensors
         trainer = Trainer(self.config, batches, validation, self.out, device, parameters)
@@ -109,9 +107,9 @@ class Run:
 
             def add(progress: Progress, figures: dict[str, float]) -> None:
                 log.add(progress, figures)
-                report(progress, figures)
+                on_epoch(progress, figures)
 
-            trainer.run(add, lambda done, of: tick(trainer.progress.epoch + 1, done, of))
+            trainer.run(add, lambda done, of: on_step(trainer.progress.epoch + 1, done, of))
         if first:
             source = self.source
             names = [(source.kind, source.train_split), *((kind, split) for kind, _, split in source.also)]
@@ -129,11 +127,11 @@ class Run:
                 _machine(),
             )
             report_on = Validation(reported, network, device)
-            self._write_checkpoint(trainer, batches, validation, report_on, origin, said)
+            self._write_checkpoint(trainer, batches, validation, report_on, origin, on_message)
         return self.out / "checkpoint"
 
     def _command(self) -> str:
-        """What repeats the run, in terms of any machine."""
+        """Return the command that repeats the run, with placeholders for paths."""
         source = self.source
         start = "" if self.start is None else " --start START"
         also = "".join(
@@ -148,9 +146,8 @@ class Run:
             f"--config SETTINGS.toml{start} --out OUT"
         )
 
-    def _open_caches(self, said: Callable[[str], None]) -> tuple[list[Cache], Cache, Cache]:
-        """Return the caches to train on, to choose the epoch on, and to report on; they are made first where
-        they are not there or stale."""
+    def _open_caches(self, on_message: Callable[[str], None]) -> tuple[list[Cache], Cache, Cache]:
+        """Return the caches for training, validation and the report; build missing or stale ones first."""
         source, config = self.source, self.config
         reader = source.reader()
 
@@ -163,16 +160,18 @@ class Run:
                 source.protocol,
                 config.network,
                 config.history_frames,
-                said,
+                on_message,
                 variants,
             )
 
         train = [opened(source.kind, reader, source.train_split, config.variants)]
         for kind, path, split in source.also:
             train.append(opened(kind, READERS[kind](path), split, config.variants))
-        judged = opened(source.kind, reader, source.validation_split)
-        reported = judged if source.report_split is None else opened(source.kind, reader, source.report_split)
-        return train, judged, reported
+        validated = opened(source.kind, reader, source.validation_split)
+        reported = (
+            validated if source.report_split is None else opened(source.kind, reader, source.report_split)
+        )
+        return train, validated, reported
 
     def _write_checkpoint(
         self,
@@ -181,9 +180,9 @@ class Run:
         validation: Validation,
         report_on: Validation,
         origin: Origin,
-        said: Callable[[str], None],
+        on_message: Callable[[str], None],
     ) -> None:
-        # The networks' own: what is made when training begins is known there only
+        # The configuration of the networks, which includes what was determined when training began
         config, network = self.config, trainer.networks.config
         trainer.networks.load_state_dict(trainer.best())
         trainer.networks.eval()
@@ -197,8 +196,8 @@ class Run:
                 calibration = fit_calibration(vehicles, train)
                 calibrate(vehicles, calibration)
             if calibration.ran_away:
-                said(f"calibration: {RAN_AWAY}")
-        figures = report_on.judge(trainer.networks, samples=SAMPLES, draws=DRAWS)
+                on_message(f"calibration: {RAN_AWAY}")
+        figures = report_on.evaluate(trainer.networks, samples=SAMPLES, draws=DRAWS)
         begun = "" if config.start is None else f"; begun with {config.start}"
         info = ModelInfo(
             name=config.method.value,
@@ -220,18 +219,12 @@ class Run:
         card = model_card(config, origin, trainer.progress, self.version, figures, calibration)
         folder = self.out / "checkpoint"
         save_checkpoint(folder, info, network, tensors, card)
-        load_checkpoint(folder).forecaster()  # what cannot be read again is no checkpoint
+        load_checkpoint(folder).forecaster()  # fails here rather than when it is served
 
 
 def _pairs(cache: Cache) -> int:
-    """Return how many pairs a cache is of, their variants not counted."""
+    """Return the number of pairs of a cache, without their variants."""
     return len(cache) // (1 + cache.manifest.key.variants)
-
-
-def _device() -> torch.device:
-    if not torch.cuda.is_available():
-        return torch.device("cpu")
-    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
 
 
 def _machine() -> str:

@@ -1,10 +1,16 @@
-"""Where a run stands, on disk: parameters and optimiser as safetensors, the rest as JSON. No pickles."""
+"""The folder of a run: its state, from which it can be resumed, and its log.
 
+Parameters and optimiser are safetensors, the rest is JSON and CSV; there are no pickles.
+"""
+
+import csv
 import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
 
 import torch
 from pydantic import ValidationError
@@ -20,18 +26,18 @@ _PROGRESS = "state.json"
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a run is."""
+    """The progress of a run."""
 
     epoch: int
     """Epochs done."""
     step: int
     """Optimiser steps done."""
     best_epoch: int
-    """The epoch (counted from 1) of the best validation; 0: none yet."""
+    """Epoch (counted from 1) with the best validation score; 0: none yet."""
     best_score: float | None
-    """Its score, the smaller the better."""
+    """Its score; smaller is better."""
     seconds: float
-    """Spent in training steps so far."""
+    """Seconds spent in training steps so far."""
 
 
 def save_state(
@@ -41,14 +47,14 @@ def save_state(
     learner: Learner,
     others: Mapping[str, nn.Module],
 ) -> None:
-    """Writes the state; whoever is interrupted in it finds the one before.
+    """Write the state of a run. If this is interrupted, the state before is still there.
 
     Args:
-        folder: of the run.
-        config: its settings.
-        progress: where it stands.
+        folder: folder of the run.
+        config: settings of the run.
+        progress: progress of the run.
         learner: networks and optimisers.
-        others: modules beside the learner's, by names that none of its has.
+        others: modules beside the learner's, by names that none of the learner's has.
     """
     tensors: dict[str, Tensor] = {
         f"{module}.{name}": tensor
@@ -61,7 +67,7 @@ def save_state(
             moments: dict[str, Tensor] = optimizer.state.get(parameter, {})
             tensors |= {f"{name}.{names[parameter]}.{moment}": value for moment, value in moments.items()}
     folder.mkdir(parents=True, exist_ok=True)
-    # The progress names its tensors' file, and is replaced last: the pair is never of two states
+    # The progress names the file of its tensors and is replaced last, so the two always belong together
     file = f"{progress.epoch:04d}.{_TENSORS}"
     save_file({name: t.detach().cpu().contiguous() for name, t in tensors.items()}, folder / file)
     document = {"config": config.model_dump(mode="json"), "progress": asdict(progress), "tensors": file}
@@ -76,10 +82,10 @@ def save_state(
 def load_state(
     folder: Path, config: TrainingConfig, learner: Learner, others: Mapping[str, nn.Module]
 ) -> Progress | None:
-    """Puts a saved state back (see ``save_state``); None where there is none.
+    """Restore a saved state (see ``save_state``); return None if there is none.
 
     Raises:
-        TrainingError: it is damaged, or of a run with other settings (more epochs are no other setting).
+        TrainingError: the state is damaged, or belongs to a run with other settings (except more epochs).
     """
     file = folder / _PROGRESS
     if not file.is_file():
@@ -106,35 +112,94 @@ def load_state(
 
 
 def _parameters(optimizer: torch.optim.Optimizer) -> list[torch.nn.Parameter]:
-    """All that an optimiser changes."""
+    """Return all parameters of an optimiser."""
     return [parameter for group in optimizer.param_groups for parameter in group["params"]]
 
 
 def _parameter_names(learner: Learner) -> dict[torch.nn.Parameter, str]:
-    """Of all networks; no name is in two of them."""
+    """Return the names of all networks' parameters; no name is in two of them."""
     return {p: name for networks in learner.modules().values() for name, p in networks.named_parameters()}
 
 
 def _check_same(file: Path, saved: Mapping[str, object], config: TrainingConfig, done: int) -> None:
     try:
-        before = TrainingConfig.model_validate(saved)  # what is newer than the run has its default
+        before = TrainingConfig.model_validate(saved)  # settings newer than the run have their defaults
     except ValidationError as error:
         names = ", ".join(".".join(map(str, one["loc"])) for one in error.errors())
-        raise TrainingError(f"{file}: is of a run with settings that there are no more: {names}") from error
+        raise TrainingError(
+            f"{file}: belongs to a run with settings that no longer exist: {names}"
+        ) from error
     other = {name for name, value in config if name != "epochs" and getattr(before, name) != value}
-    if before.epochs != config.epochs and done > _settled(before, config):
+    if before.epochs != config.epochs and done > _unaffected_epochs(before, config):
         other.add("epochs")
     if other:
-        raise TrainingError(f"{file}: is of a run with other settings: {', '.join(sorted(other))}")
+        raise TrainingError(f"{file}: belongs to a run with other settings: {', '.join(sorted(other))}")
 
 
-def _settled(before: TrainingConfig, now: TrainingConfig) -> float:
-    """How many epochs may have been done before it makes a difference of how many they are."""
+def _unaffected_epochs(before: TrainingConfig, now: TrainingConfig) -> float:
+    """Return the number of epochs that do not depend on how many there are in all."""
     both = (before, now)
     cooling = min(each.epochs - each.cooldown_epochs if each.cooldown_epochs else math.inf for each in both)
-    apart = {each.epochs_apart for each in both} if now.displacement_weight else set()
-    return min(cooling, *apart) if len(apart) > 1 else cooling
+    starts = {each.displacement_start for each in both} if now.displacement_weight else set()
+    return min(cooling, *starts) if len(starts) > 1 else cooling
 
 
 def _under(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the tensors whose names begin so, by the rest of their names."""
     return {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
+
+
+class RunLog:
+    """The figures of a run, a row an epoch, in ``log.csv``, and in TensorBoard where it is installed.
+
+    Args:
+        folder: folder of the run; TensorBoard's files go into ``tensorboard/`` there.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self._file = folder / "log.csv"
+        self._board = _summary_writer(folder / "tensorboard")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._board is not None:
+            self._board.close()
+
+    def add(self, progress: Progress, figures: dict[str, float]) -> None:
+        """Add an epoch; rows of the same or later epochs, from an interrupted run, are replaced."""
+        row = {"epoch": progress.epoch, "step": progress.step} | figures
+        rows = [old for old in self.rows() if int(old["epoch"]) < progress.epoch]
+        names = list(dict.fromkeys([*(name for old in rows for name in old), *row]))
+        temporary = self._file.with_suffix(".new")
+        with temporary.open("w", newline="", encoding="utf-8") as stream:
+            writer = csv.DictWriter(stream, names, restval="")
+            writer.writeheader()
+            writer.writerows([*rows, row])
+        temporary.replace(self._file)
+        if self._board is not None:
+            for name, value in figures.items():
+                self._board.add_scalar(name, value, progress.epoch)
+            self._board.flush()
+
+    def rows(self) -> list[dict[str, str]]:
+        """Return all rows, as text."""
+        if not self._file.is_file():
+            return []
+        with self._file.open(newline="", encoding="utf-8") as stream:
+            return list(csv.DictReader(stream))
+
+
+def _summary_writer(folder: Path) -> Any:
+    try:
+        from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415 (an extra)
+    except ImportError:
+        return None
+    return SummaryWriter(str(folder))

@@ -1,4 +1,4 @@
-"""Judges networks on a split."""
+"""Evaluation of networks on the pairs of a split."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -23,27 +23,27 @@ BATCH = 512
 
 
 @dataclass(frozen=True)
-class JudgedBatch:
-    """N pairs, and what their forecasts are judged by."""
+class EvaluationBatch:
+    """N pairs, and what their forecasts are evaluated against."""
 
     features: Features
-    """Full context, on the device."""
+    """Features with full context, on the device."""
     truth: Floats
     """[N, 12, 2], m, ground frame."""
     rasters: Sequence[Raster]
-    """N; pairs of a scene share one."""
+    """N rasters; pairs of a scene share one."""
     stood: Bools
-    """[N], whether the agent stood before now (``model.metrics.standing``)."""
+    """[N], whether the agents stood before now (``model.metrics.standing``)."""
     seeds: Sequence[int]
-    """N, the pairs' numbers in the split: what is drawn for a pair does not hang on its batch."""
+    """N numbers of the pairs in the split, so that samples of a pair do not depend on its batch."""
 
     def metrics(self, mixture: TrajectoryMixture, samples: int, draws: int) -> dict[str, Floats]:
-        """``instance_metrics`` of forecasts of these pairs.
+        """Return ``instance_metrics`` of forecasts of these pairs.
 
         Args:
             mixture: the forecasts.
-            samples: trajectories drawn for each pair; 0 leaves such figures out.
-            draws: for calibration; 0 leaves it out.
+            samples: trajectories drawn for each pair; 0: no sampled figures.
+            draws: positions drawn for calibration; 0: no calibration.
         """
         seeds = self.seeds if samples or draws else None
         return instance_metrics(
@@ -52,12 +52,12 @@ class JudgedBatch:
 
 
 class Validation:
-    """Figures of networks on the pairs of a cache, by the metrics of ``model.metrics.evaluate``.
+    """A split on which networks are evaluated, by the metrics of ``model.metrics.evaluate``.
 
     Args:
-        cache: the split.
-        config: of the networks; None: features of all that the cache has.
-        device: where they are.
+        cache: cache of the split.
+        config: configuration of the networks; None: all features of the cache.
+        device: device of the networks.
     """
 
     def __init__(self, cache: Cache, config: AnyNetworkConfig | None, device: torch.device) -> None:
@@ -66,26 +66,26 @@ class Validation:
         self._stood = stood(cache.observed_positions())
 
     def __call__(self, networks: Networks[Any]) -> dict[str, float]:
-        """The figures that need no samples, quick enough for after each epoch."""
-        return self.judge(networks, samples=0, draws=0)
+        """Return the figures that need no samples; they are quick enough for each epoch."""
+        return self.evaluate(networks, samples=0, draws=0)
 
     @property
     def pairs(self) -> Batches:
-        """The pairs themselves."""
+        """The pairs of the split."""
         return self._batches
 
     def __len__(self) -> int:
-        """How many pairs there are."""
+        """Return the number of pairs."""
         return len(self._batches)
 
     @torch.no_grad()
-    def judge(self, networks: Networks[Any], samples: int, draws: int) -> dict[str, float]:
-        """All figures.
+    def evaluate(self, networks: Networks[Any], samples: int, draws: int) -> dict[str, float]:
+        """Return all figures by name.
 
         Args:
-            networks: in evaluation mode.
-            samples: trajectories drawn for each pair; 0 leaves such figures out.
-            draws: for calibration; 0 leaves it out.
+            networks: networks in evaluation mode.
+            samples: trajectories drawn for each pair; 0: no sampled figures.
+            draws: positions drawn for calibration; 0: no calibration.
         """
         network = networks.of(AgentType.VEHICLE)
         means = MetricMeans()
@@ -94,11 +94,11 @@ class Validation:
             means.add(batch.metrics(mixture, samples, draws))
         return {name: value for name, value in means.figures().items() if np.isfinite(value)}
 
-    def batches(self, limit: int | None = None) -> Iterator[JudgedBatch]:
-        """The pairs in order, some at a time; only the maps of those are in memory.
+    def batches(self, limit: int | None = None) -> Iterator[EvaluationBatch]:
+        """Yield the pairs in order, a batch at a time; only the batch's maps are in memory.
 
         Args:
-            limit: how many of the first pairs; None: all.
+            limit: number of pairs, from the first on; None: all.
         """
         count = len(self) if limit is None else min(limit, len(self))
         for start in range(0, count, BATCH):
@@ -107,7 +107,7 @@ class Validation:
             truth = (future.double() + features["origin"][:, None]).cpu().numpy()
             scenes = self._cache.scene[indices.numpy()].tolist()
             rasters = {scene: self._cache.raster(scene) for scene in set(scenes)}
-            yield JudgedBatch(
+            yield EvaluationBatch(
                 features,
                 truth,
                 [rasters[scene] for scene in scenes],

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from model.data.batches import Batches, JoinedPairs
-from model.data.cache import Cache, build_cache
-from model.data.caches import open_cache
+from model.data.cache import Cache
+from model.data.cache_builder import build_cache, open_cache
 from model.data.packing import unpack_patches
 from model.data.protocols import frame_scene
 from model.data.scenes import DataError, Pair, SceneRecord, Track

@@ -9,7 +9,8 @@ import torch
 
 from model.arrays import Floats
 from model.data.batches import Batches
-from model.data.cache import Cache, build_cache
+from model.data.cache import Cache
+from model.data.cache_builder import build_cache
 from model.data.protocols import frame_scene
 from model.data.scenes import DataError, SceneRecord
 from model.features.scene_features import ground_frame_features

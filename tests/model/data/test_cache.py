@@ -8,9 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from model.data.cache import Cache, CacheKey, build_cache
+from model.data import cache, cache_builder, synthetic
+from model.data.cache import Cache
+from model.data.cache_builder import build_cache, open_cache
+from model.data.cache_layout import FORMAT_VERSION, CacheKey
 from model.data.protocols import frame_scene
 from model.data.scenes import DataError, Pair, SceneRecord
+from model.data.synthetic import SyntheticReader
 from model.features.scene_features import ground_frame_features, network_features
 from model.forecaster import Context, Protocol
 from model.networks.config import AnyNetworkConfig, BlindContext, CoverNetConfig, NetworkConfig
@@ -169,7 +173,7 @@ def _manifest(change: dict[str, object]) -> Callable[[Path], None]:
         (lambda folder: (folder / "manifest.json").unlink(), "manifest.json: there is no such file"),
         (lambda folder: (folder / "manifest.json").write_text("{"), "manifest.json: cannot be read"),
         (lambda folder: (folder / "manifest.json").write_text("[1]"), r"manifest.json: "),
-        (_manifest({"format_version": 99}), "format version 99, not 3"),
+        (_manifest({"format_version": 99}), "format version 99, not 3; the cache has to be rebuilt"),
         (_manifest({"pairs": 0}), "manifest.json: pairs"),
         (_manifest({"pairs": 3}), r"\.npy: holds .* not .*3"),
         (_manifest({"more": 3}), "manifest.json: more"),
@@ -236,3 +240,59 @@ def test_pairs_that_cannot_be_trained_on_are_refused(tmp_path: Path, pair: Pair,
 def test_a_raster_that_would_be_coarsened_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="scene-1: a raster of 6 pixels per metre is too fine"):
         _build(tmp_path / "cache", FixedReader(replace(RECORDS[0], raster=raster(scale=6.0))))
+
+
+def _open(folder: Path, messages: list[str], history_frames: int = FRAMES) -> Cache:
+    return open_cache(
+        folder, READER, "made", "some", Protocol.CAUSAL, CONFIG, history_frames, messages.append
+    )
+
+
+def test_a_cache_is_built_once_for_each_setting(tmp_path: Path) -> None:
+    messages: list[str] = []
+    _open(tmp_path, messages)
+    _open(tmp_path, messages)
+    assert len(messages) == 1
+    assert "building the cache of some" in messages[0]
+    assert "there is no such file; the cache has to be built" in messages[0]
+    assert _open(tmp_path, messages, history_frames=9).history.shape[1] == 9
+    assert len(messages) == 2
+    assert _open(tmp_path, messages).history.shape[1] == FRAMES
+    assert len(messages) == 2
+
+
+def test_a_cache_with_other_settings_in_its_place_is_rebuilt(tmp_path: Path) -> None:
+    messages: list[str] = []
+    _open(tmp_path, messages)
+    (folder,) = tmp_path.iterdir()
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["key"]["data"] = "elsewhere"
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    assert _open(tmp_path, messages).manifest.key == KEY
+    assert len(messages) == 2
+    assert "other settings: data is elsewhere, not made up" in messages[1]
+
+
+def test_a_cache_of_another_format_version_is_rebuilt(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    messages: list[str] = []
+    _open(tmp_path, messages)
+    (folder,) = tmp_path.iterdir()
+    for module in (cache, cache_builder):
+        monkeypatch.setattr(module, "FORMAT_VERSION", FORMAT_VERSION + 1)
+    with pytest.raises(
+        DataError, match=f"format version {FORMAT_VERSION}, not {FORMAT_VERSION + 1}; .*rebuilt"
+    ):
+        Cache.open(folder, KEY)
+    assert _open(tmp_path, messages).manifest.format_version == FORMAT_VERSION + 1
+    assert len(messages) == 2
+    assert f"format version {FORMAT_VERSION}, not {FORMAT_VERSION + 1}" in messages[1]
+    _open(tmp_path, messages)
+    assert len(messages) == 2
+
+
+def test_made_up_scenes_of_another_version_are_other_data(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = SyntheticReader(Path("1")).place
+    monkeypatch.setattr(synthetic, "VERSION", synthetic.VERSION + 1)
+    assert SyntheticReader(Path("1")).place != before

@@ -7,7 +7,8 @@ import torch
 from model.baselines import physics
 from model.baselines.kalman import Kalman
 from model.baselines.unimodal import unimodal
-from model.data.cache import Cache, build_cache
+from model.data.cache import Cache
+from model.data.cache_builder import build_cache
 from model.data.protocols import frame_scene
 from model.data.scenes import DataError, Pair, SceneRecord
 from model.evaluation.baselines import judge_baselines, scene_pairs

@@ -15,7 +15,14 @@ from model.networks.covernet import CoverNet
 from model.networks.dynamics import Positions
 from model.networks.network import AgentNetwork
 from model.scenes.scene import AgentType
-from model.training.calibration import LEAST, MOST, Calibration, _least, calibrate, fit_calibration
+from model.training.calibration import (
+    MAX_FACTOR,
+    MIN_FACTOR,
+    Calibration,
+    _minimize,
+    calibrate,
+    fit_calibration,
+)
 from model.training.config import Method
 from model.training.covernet import CoverNetLearner
 from tests.model.training.fakes import MadeUpPairs, small_config
@@ -135,7 +142,7 @@ def check_built_in(network: AgentNetwork | CoverNet, context: Context) -> None:
         weights, positions = network(features, context, 12)
         own_branch = context is Context.BLIND and getattr(network, "blind", None) is not None
         shown = calibration._replace(width=blind_width) if own_branch else calibration
-        expected = shown.of(TrajectoryMixture(weights, positions.mean, positions.covariance, origin))
+        expected = shown.apply(TrajectoryMixture(weights, positions.mean, positions.covariance, origin))
         calibrate(network, calibration)
         weights_after, after = network(features, context, 12)
     assert torch.equal(positions.mean, after.mean)
@@ -145,9 +152,9 @@ def check_built_in(network: AgentNetwork | CoverNet, context: Context) -> None:
     torch.testing.assert_close(after.covariance, expected.covariances, rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("number", [LEAST, MOST])
+@pytest.mark.parametrize("number", [MIN_FACTOR, MAX_FACTOR])
 def test_a_number_at_a_bound_is_known(number: float) -> None:
-    found = _least(lambda value: abs(math.log(value / number)))
+    found = _minimize(lambda value: abs(math.log(value / number)))
     assert Calibration(found, 1.0).ran_away
     assert Calibration(1.0, found).ran_away
     assert Calibration(1.0, 1.0, found).ran_away

@@ -7,7 +7,7 @@ from model.networks.covernet import present_heading, turned
 from model.training.config import Method
 from model.training.covernet import CoverNetLearner
 from model.training.learner import Batch
-from model.training.objectives import Weights
+from model.training.objectives import LossWeights
 from tests.model.training.fakes import MadeUpPairs, small_config
 
 PAIRS = MadeUpPairs(12)
@@ -19,7 +19,7 @@ def terms(displacement: float) -> tuple[CoverNetLearner, dict[str, float]]:
     learner = CoverNetLearner(small_config(Method.COVERNET), PAIRS.paths, torch.device("cpu"))
     learner.networks.eval()
     batch = Batch(*PAIRS.batch(torch.arange(12)))
-    step = learner.step([batch], Weights(1.0, 5.0, displacement=displacement), rate=0.0)
+    step = learner.step([batch], LossWeights(1.0, 5.0, displacement=displacement), rate=0.0)
     return learner, {name: term.item() for name, term in step.items()}
 
 

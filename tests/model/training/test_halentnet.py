@@ -12,11 +12,11 @@ from model.scenes.scene import AgentType
 from model.training.config import Method
 from model.training.halentnet import FIRST_SWITCH, LAST_SWITCH, STEPS, HalentLearner
 from model.training.learner import Batch
-from model.training.objectives import Weights
+from model.training.objectives import LossWeights
 from tests.model.training.fakes import MadeUpPairs, small_config
 
 PAIRS = MadeUpPairs(48)
-WEIGHTS = Weights(kl=1.0, logit_clip=5.0)
+WEIGHTS = LossWeights(kl=1.0, logit_clip=5.0)
 
 
 def batch(start: int) -> Batch:
@@ -51,29 +51,29 @@ def test_one_step_teaches_both_networks_and_names_its_terms(learner: HalentLearn
 
 def test_each_adversarial_part_teaches_its_own_network(learner: HalentLearner) -> None:
     generator, discriminator = parameters(learner.networks), parameters(learner.discriminator)
-    learner.learn_to_tell(batch(0), WEIGHTS)
+    learner.train_discriminator(batch(0), WEIGHTS)
     assert same(learner.networks, generator)
     assert not same(learner.discriminator, discriminator)
     discriminator = parameters(learner.discriminator)
-    learner.learn_to_fool(batch(16), WEIGHTS, 0.01)
+    learner.train_generator(batch(16), WEIGHTS, 0.01)
     assert not same(learner.networks, generator)
     assert same(learner.discriminator, discriminator)
 
 
 def test_the_discriminator_learns_to_tell(learner: HalentLearner) -> None:
-    told = [learner.learn_to_tell(batch(0), WEIGHTS)["discriminator"].item() for _ in range(6)]
+    told = [learner.train_discriminator(batch(0), WEIGHTS)["discriminator"].item() for _ in range(6)]
     assert told[-1] < 0.5 * told[0]
 
 
 def test_the_generator_learns_to_fool_and_leaves_the_discriminator_alone(learner: HalentLearner) -> None:
     for _ in range(10):
-        learner.learn_to_tell(batch(0), WEIGHTS)
+        learner.train_discriminator(batch(0), WEIGHTS)
     weights = {k: v.clone() for k, v in learner.discriminator.named_parameters()}
     learner.discriminator.eval()  # no power iterations
     fooled = []
     for _ in range(8):
         torch.manual_seed(1)  # the same samples and dropout each time
-        fooled.append(learner.learn_to_fool(batch(0), WEIGHTS, 0.003)["fool"].item())
+        fooled.append(learner.train_generator(batch(0), WEIGHTS, 0.003)["fool"].item())
     assert min(fooled[1:]) < 0.9 * fooled[0], fooled
     assert all(torch.equal(v, weights[k]) for k, v in learner.discriminator.named_parameters())
     assert all(v.requires_grad for v in learner.discriminator.parameters())

@@ -16,10 +16,9 @@ from model.networks.covernet import CoverNet
 from model.networks.forecaster import CvaeNetworks, Networks
 from model.scenes.scene import AgentType
 from model.training.config import Method, TrainingConfig, TrainingError, load_config
-from model.training.dropout import scale_dropout
-from model.training.learner import Batch
+from model.training.learner import Batch, scale_dropout
 from model.training.loop import SCORE, Trainer
-from model.training.objectives import Weights
+from model.training.objectives import LossWeights
 from model.training.sampling import epoch_order
 from model.training.state import Progress
 from tests.model.training.fakes import MadeUpPairs, small_config
@@ -77,7 +76,7 @@ def test_a_run_in_two_parts_is_the_same_as_in_one(tmp_path: Path, method: Method
 
 
 def test_with_averaging_the_running_mean_is_judged_and_kept(tmp_path: Path) -> None:
-    config = small_config(Method.TRAJECTRON, epochs=1, averaging=0.5)
+    config = small_config(Method.TRAJECTRON, epochs=1, ema_decay=0.5)
     judged: list[dict[str, Tensor]] = []
     steps: list[dict[str, Tensor]] = []
 
@@ -104,7 +103,7 @@ def test_with_averaging_the_running_mean_is_judged_and_kept(tmp_path: Path) -> N
 
 def test_the_running_mean_is_resumed_exactly(tmp_path: Path) -> None:
     def config(epochs: int) -> TrainingConfig:
-        return small_config(Method.TRAJECTRON, epochs=epochs, averaging=0.9)
+        return small_config(Method.TRAJECTRON, epochs=epochs, ema_decay=0.9)
 
     whole, _ = train(config(2), tmp_path / "whole")
     train(config(1), tmp_path / "parts")
@@ -130,7 +129,7 @@ def test_dropout_is_scaled_in_every_method(tmp_path: Path, method: Method, facto
 @pytest.mark.parametrize("method", [Method.CAB, Method.COVERNET])
 def test_the_displacement_may_come_later(tmp_path: Path, method: Method) -> None:
     _, reports = train(
-        small_config(method, epochs=2, displacement_weight=1.0, displacement_after=1), tmp_path
+        small_config(method, epochs=2, displacement_weight=1.0, displacement_warmup_epochs=1), tmp_path
     )
     without, with_it = ({name for name in each if name.startswith("displacement")} for each in reports)
     assert not without
@@ -161,13 +160,13 @@ def test_about_half_of_the_agents_are_mirrored_if_asked(
     seen: list[Batch] = []
     step = trainer.learner.step
 
-    def watch(batches: Sequence[Batch], weights: Weights, rate: float) -> dict[str, Tensor]:
+    def watch(batches: Sequence[Batch], weights: LossWeights, rate: float) -> dict[str, Tensor]:
         seen.extend(batches)
         return step(batches, weights, rate)
 
     monkeypatch.setattr(trainer.learner, "step", watch)
     trainer.run(lambda progress, figures: None, lambda done, batches: None)
-    known, future = PAIRS.batch(epoch_order(PAIRS.turned, config.curved_copies, config.seed, epoch=0))
+    known, future = PAIRS.batch(epoch_order(PAIRS.turned, config.curved_oversampling, config.seed, epoch=0))
     got = torch.cat([batch.future for batch in seen])
     expected, velocity = future[: len(got)], known["velocity"][: len(got)]
     mirrored = (got[..., 1] == -expected[..., 1]).all(dim=1)
@@ -188,18 +187,20 @@ def test_those_who_stood_and_leave_are_shown_as_staying(
         def leaving(self) -> Tensor:
             return torch.arange(len(self)) % 2 == 0
 
-    config = small_config(Method.TRAJECTRON, epochs=1, leaving_share=0.0, mirror=False, rotate=False)
+    config = small_config(
+        Method.TRAJECTRON, epochs=1, leaving_keep_probability=0.0, mirror=False, rotate=False
+    )
     pairs = Leaving(len(PAIRS))
     trainer = Trainer(config, pairs, validate, tmp_path, torch.device("cpu"))
     seen: list[Batch] = []
 
-    def watch(batches: Sequence[Batch], weights: Weights, rate: float) -> dict[str, Tensor]:
+    def watch(batches: Sequence[Batch], weights: LossWeights, rate: float) -> dict[str, Tensor]:
         seen.extend(batches)
         return {}
 
     monkeypatch.setattr(trainer.learner, "step", watch)
     trainer.run(lambda progress, figures: None, lambda done, batches: None)
-    order = epoch_order(pairs.turned, config.curved_copies, config.seed, epoch=0)
+    order = epoch_order(pairs.turned, config.curved_oversampling, config.seed, epoch=0)
     got = torch.cat([batch.future for batch in seen])
     order = order[: len(got)]
     stays = (got == 0).flatten(1).all(dim=1)
@@ -267,10 +268,10 @@ def test_the_best_epoch_is_kept(tmp_path: Path) -> None:
 
 def test_of_how_many_epochs_half_have_no_displacement_is_then_fixed(tmp_path: Path) -> None:
     def config(epochs: int, after: int = 2) -> TrainingConfig:
-        return small_config(epochs=epochs, displacement_weight=1.0, displacement_after=after)
+        return small_config(epochs=epochs, displacement_weight=1.0, displacement_warmup_epochs=after)
 
-    assert [config(epochs).epochs_apart for epochs in (1, 2, 3, 4, 9)] == [0, 1, 1, 2, 2]
-    assert config(9).model_copy(update={"start": "cab@1.0.0 (causal)"}).epochs_apart == 0
+    assert [config(epochs).displacement_start for epochs in (1, 2, 3, 4, 9)] == [0, 1, 1, 2, 2]
+    assert config(9).model_copy(update={"start": "cab@1.0.0 (causal)"}).displacement_start == 0
     train(config(2), tmp_path)
     with pytest.raises(TrainingError, match="other settings: epochs"):
         train(config(4), tmp_path)
@@ -281,14 +282,48 @@ def test_settings_that_a_run_did_not_know_have_their_defaults(tmp_path: Path) ->
     train(small_config(epochs=1), tmp_path)
     file = tmp_path / "state.json"
     state = json.loads(file.read_text())
-    del state["config"]["displacement_after"], state["config"]["network"]["max_control_sigma"]
+    del state["config"]["displacement_warmup_epochs"], state["config"]["network"]["max_control_sigma"]
     file.write_text(json.dumps(state))
     assert len(train(small_config(epochs=2), tmp_path)[1]) == 1
     state = json.loads(file.read_text())
     state["config"]["no_more"] = 1
     file.write_text(json.dumps(state))
-    with pytest.raises(TrainingError, match="settings that there are no more: no_more"):
+    with pytest.raises(TrainingError, match="settings that no longer exist: no_more"):
         train(small_config(epochs=2), tmp_path)
+
+
+def test_a_run_that_was_saved_with_the_old_names_of_its_settings_is_resumed(tmp_path: Path) -> None:
+    def config(epochs: int, ema_decay: float = 0.9) -> TrainingConfig:
+        return small_config(
+            epochs=epochs, ema_decay=ema_decay, displacement_weight=1.0, displacement_warmup_epochs=1
+        )
+
+    whole, _ = train(config(3), tmp_path / "whole")
+    train(config(2), tmp_path / "parts")
+    file = tmp_path / "parts/state.json"
+    state = json.loads(file.read_text())
+    for old, new in (
+        ("averaging", "ema_decay"),
+        ("least_learning_rate", "min_learning_rate"),
+        ("displacement_after", "displacement_warmup_epochs"),
+        ("least_step_likelihood", "min_step_likelihood"),
+        ("curved_copies", "curved_oversampling"),
+        ("leaving_share", "leaving_keep_probability"),
+        ("apart_weight", "blind_kl_weight"),
+        ("hide", "context_dropout"),
+        ("block", "stopped_vehicles"),
+    ):
+        state["config"][old] = state["config"].pop(new)
+    state["config"]["mixture"]["nearest"] = state["config"]["mixture"].pop("min_ade")
+    file.write_text(json.dumps(state))
+    parts, reports = train(config(3), tmp_path / "parts")
+    assert len(reports) == 1
+    assert all(torch.equal(tensor, parts.best()[name]) for name, tensor in whole.best().items())
+    state = json.loads(file.read_text())
+    state["config"]["averaging"] = state["config"].pop("ema_decay")
+    file.write_text(json.dumps(state))
+    with pytest.raises(TrainingError, match="other settings: ema_decay"):
+        train(config(4, ema_decay=0.8), tmp_path / "parts")
 
 
 def test_a_run_with_other_settings_is_not_resumed(tmp_path: Path) -> None:
@@ -321,12 +356,12 @@ def test_every_method_is_trained_as_published_on_request(method: Method) -> None
         assert changed == (set() if method is Method.COVERNET else {"max_control_sigma"})
     assert not published.in_agent_frame
     assert getattr(published.network, "max_control_sigma", None) is None
-    assert (published.kl_weight, published.apart_weight, published.epochs) == (100, 5, 40)
+    assert (published.kl_weight, published.blind_kl_weight, published.epochs) == (100, 5, 40)
     assert published.displacement_weight == 0
-    assert ours.displacement_weight > 0 or ours.mixture.expected > 0
+    assert ours.displacement_weight > 0 or ours.mixture.expected_ade > 0
     assert published.rotate is (ours.in_agent_frame or ours.rotate)
     assert load_config(method, published=True, epochs=3).epochs == 3
-    changes = {"epochs", "cooldown_epochs", "averaging"}
+    changes = {"epochs", "cooldown_epochs", "ema_decay"}
     changes |= {"mixture", "variants"} if ours.in_agent_frame else {"displacement_weight"}
     assert {name for name, value in published if value != getattr(ours, name)} >= changes
 
@@ -334,8 +369,8 @@ def test_every_method_is_trained_as_published_on_request(method: Method) -> None
 def test_a_short_run_has_short_phases() -> None:
     whole, short = load_config(Method.RUBIZ), load_config(Method.RUBIZ, epochs=3)
     assert whole.cooldown_epochs > 3
-    assert whole.epochs_apart > 1
-    assert (short.cooldown_epochs, short.epochs_apart) == (3, 1)
+    assert whole.displacement_start > 1
+    assert (short.cooldown_epochs, short.displacement_start) == (3, 1)
     more = load_config(Method.RUBIZ, epochs=whole.epochs + 1)
     assert more == whole.model_copy(update={"epochs": whole.epochs + 1})
     assert load_config(Method.RUBIZ, epochs=3, cooldown_epochs=1).cooldown_epochs == 1
@@ -370,7 +405,7 @@ def test_wrong_settings_are_named(tmp_path: Path) -> None:
     with pytest.raises(TrainingError, match="published: network, start cannot be there"):
         load_config(Method.CAB, file, published=True)
     file.write_text('description = ""\nlearning_rate = 1\n[network]\nkind = "covernet"\n')
-    with pytest.raises(TrainingError, match="of kind covernet does not learn by cab"):
+    with pytest.raises(TrainingError, match="cab does not train a network of kind covernet"):
         load_config(Method.CAB, file)
     file.write_text('description = ""\nlearning_rate = 1\n[network]\nkind = "oracle"\n')
     with pytest.raises(TrainingError, match="network: kind must be cvae or covernet"):

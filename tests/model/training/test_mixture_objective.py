@@ -13,11 +13,12 @@ from model.features.spec import Frame
 from model.forecaster import Context, Features
 from model.networks.agent_frame import STEPS, AgentFrameNetwork
 from model.networks.config import BlindContext, NetworkConfig
-from model.training.mixture_objective import MixtureWeights, mixture_objective, step_log_density
+from model.training.config import MixtureWeights
+from model.training.mixture_objective import mixture_objective, step_log_density
 
 CONFIG = NetworkConfig(frame=Frame.AGENT, far_map=True, blind=BlindContext.NULL, modes=12)
 NOTHING = dict.fromkeys(
-    ("likelihood", "joint_likelihood", "nearest", "choice", "expected", "off_road", "proposal", "apart"), 0.0
+    ("nll", "joint_nll", "min_ade", "classification", "expected_ade", "off_road", "proposal", "blind_kl"), 0.0
 )
 
 
@@ -66,17 +67,17 @@ def test_each_term_by_itself(network: AgentFrameNetwork, features: Features, fut
     ranked = weights.argsort(dim=1, descending=True)
     rows = torch.arange(5)
     expected = {
-        "likelihood": -torch.logsumexp(weights.double().log()[..., None] + density, dim=1).mean(),
-        "joint_likelihood": -torch.logsumexp(weights.double().log() + density.sum(-1), dim=1).mean() / STEPS,
-        "nearest": mean[rows, score.argmin(dim=1)].mean(),
-        "likeliest": mean[rows, ranked[:, 0]].mean(),
-        "expected": (weights * mean).sum(dim=1).mean(),
-        "choice": -((-score).softmax(dim=1) * weights.log()).sum(dim=1).mean(),
+        "nll": -torch.logsumexp(weights.double().log()[..., None] + density, dim=1).mean(),
+        "joint_nll": -torch.logsumexp(weights.double().log() + density.sum(-1), dim=1).mean() / STEPS,
+        "min_ade": mean[rows, score.argmin(dim=1)].mean(),
+        "most_likely_ade": mean[rows, ranked[:, 0]].mean(),
+        "expected_ade": (weights * mean).sum(dim=1).mean(),
+        "classification": -((-score).softmax(dim=1) * weights.log()).sum(dim=1).mean(),
     }
     for count in (5, 10):
         first = ranked[:, :count]
         chosen = first.gather(1, score.gather(1, first).argmin(dim=1, keepdim=True))
-        expected[f"nearest_of_{count}"] = mean.gather(1, chosen).mean()
+        expected[f"min_ade_{count}"] = mean.gather(1, chosen).mean()
     for name, wanted in expected.items():
         got = value(network, features, future, only(**{name: 1.0}))
         assert got.item() == pytest.approx(wanted.item(), rel=2e-3, abs=2e-3), name
@@ -98,7 +99,7 @@ def test_density_has_the_floor(network: AgentFrameNetwork, features: Features, f
 def test_the_likeliest_is_pulled_without_moving_probabilities(
     network: AgentFrameNetwork, features: Features, future: Tensor
 ) -> None:
-    value(network, features, future, only(likeliest=1.0)).backward()
+    value(network, features, future, only(most_likely_ade=1.0)).backward()
     assert network.propose.weight.grad is not None
     assert network.propose.weight.grad.abs().max() > 0
     for head in (network.logits, network.mode_logits):
@@ -108,7 +109,7 @@ def test_the_likeliest_is_pulled_without_moving_probabilities(
 def test_the_expected_distance_moves_probabilities(
     network: AgentFrameNetwork, features: Features, future: Tensor
 ) -> None:
-    value(network, features, future, only(expected=1.0)).backward()
+    value(network, features, future, only(expected_ade=1.0)).backward()
     assert network.mode_logits.weight.grad is not None
     assert network.mode_logits.weight.grad.abs().max() > 0
 
@@ -127,7 +128,7 @@ def test_off_road_is_the_share_of_the_steps_there(
 def test_cab_adds_its_blind_forecast_and_presses_apart(
     network: AgentFrameNetwork, features: Features, future: Tensor
 ) -> None:
-    plain = only(likelihood=1.0)
+    plain = only(nll=1.0)
     full = value(network, features, future, plain).item()
     loss = mixture_objective(
         network, features, future, plain.model_copy(update={"blind": 0.5}), contrast=True
@@ -135,7 +136,7 @@ def test_cab_adds_its_blind_forecast_and_presses_apart(
     blind = loss.terms["nll_blind"].item()
     assert loss.value.item() == pytest.approx(full + 0.5 * blind, rel=1e-5)
     apart = mixture_objective(
-        network, features, future, plain.model_copy(update={"blind": 0.0, "apart": 2.0}), contrast=True
+        network, features, future, plain.model_copy(update={"blind": 0.0, "blind_kl": 2.0}), contrast=True
     )
     assert apart.terms["kl_full_blind"].item() > 0
     assert apart.value.item() == pytest.approx(full - 2 * apart.terms["kl_full_blind"].item(), rel=1e-4)
@@ -144,12 +145,10 @@ def test_cab_adds_its_blind_forecast_and_presses_apart(
 def test_a_part_of_the_batch_may_be_forecast_blindly(
     network: AgentFrameNetwork, features: Features, future: Tensor
 ) -> None:
-    weights = only(likelihood=1.0, blind=1.0, blind_share=0.4)
+    weights = only(nll=1.0, blind=1.0, blind_share=0.4)
     some = {name: values[:2] for name, values in features.items()}
     part = mixture_objective(network, features, future, weights, contrast=True).terms["nll_blind"]
-    whole = mixture_objective(network, some, future[:2], only(likelihood=1.0), contrast=True).terms[
-        "nll_blind"
-    ]
+    whole = mixture_objective(network, some, future[:2], only(nll=1.0), contrast=True).terms["nll_blind"]
     assert part.item() == pytest.approx(whole.item(), rel=1e-5)
 
 

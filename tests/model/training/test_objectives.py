@@ -23,7 +23,7 @@ from model.networks.config import BlindContext, NetworkConfig
 from model.networks.network import AgentNetwork
 from model.scenes.scene import AgentType
 from model.training.elbo import (
-    LEAST_KL,
+    MIN_KL,
     clamped_divergence,
     context_terms,
     divergence,
@@ -31,7 +31,7 @@ from model.training.elbo import (
     log_likelihood,
     mutual_information,
 )
-from model.training.objectives import OBJECTIVES, Loss, Weights, fused_terms
+from model.training.objectives import OBJECTIVES, Loss, LossWeights, fused_terms
 from tests.model.networks.golden import golden_features
 from tests.model.networks.released import FLOAT32_ROUNDING, Released
 from tests.model.training.fakes import MadeUpPairs
@@ -89,7 +89,7 @@ class Golden(NamedTuple):
     network: AgentNetwork
     features: Features
     future: Tensor
-    weights: Weights
+    weights: LossWeights
     loss: float
     terms: dict[str, float]
     norms: dict[str, float]
@@ -128,7 +128,7 @@ def golden(shared: Path, request: pytest.FixtureRequest) -> Golden:
     network.eval()  # the golden losses are without dropout
     features = golden_features(folder / "inputs.npz", AgentType.VEHICLE)
     future = torch.from_numpy(np.load(folder / "inputs.npz")["future"]) - features["origin"][:, None]
-    weights = Weights(file["kl_weight"], file["z_logit_clip"], sample_controls=False)
+    weights = LossWeights(file["kl_weight"], file["z_logit_clip"], sample_controls=False)
     norms: dict[str, float] = {}
     none: set[str] = set()
     for name, norm in file["grad_norms"].items():
@@ -215,7 +215,7 @@ def test_rubiz_fuses_normalised_logits(golden: Golden) -> None:
 
 def test_divergence_has_a_floor_but_keeps_its_value_above() -> None:
     logits = torch.tensor([[2.0, 0.0, -2.0]]).log_softmax(-1)
-    assert clamped_divergence(logits, logits).item() == pytest.approx(LEAST_KL)
+    assert clamped_divergence(logits, logits).item() == pytest.approx(MIN_KL)
     other = torch.tensor([[-2.0, 0.0, 2.0]]).log_softmax(-1)
     expected = (logits.exp() * (logits - other)).sum().item()
     assert clamped_divergence(logits, other).item() == pytest.approx(expected)
@@ -252,7 +252,7 @@ def test_the_displacement_counts_as_much_as_it_weighs(method: str) -> None:
     given, future = source.batch(torch.arange(6))
 
     def loss(weight: float) -> Loss:
-        weights = Weights(1.0, 5.0, sample_controls=False, displacement=weight)
+        weights = LossWeights(1.0, 5.0, sample_controls=False, displacement=weight)
         return OBJECTIVES[method](network, given, future, weights)
 
     without, light, heavy = loss(0.0), loss(1.0), loss(2.5)
@@ -271,8 +271,8 @@ def test_cab_presses_full_and_blind_apart_as_much_as_it_weighs() -> None:
     network = AgentNetwork(NetworkConfig(blind=BlindContext.NULL, modes=3), AgentType.VEHICLE).eval()
     given, future = MadeUpPairs(6).batch(torch.arange(6))
     released, light = (
-        OBJECTIVES["cab"](network, given, future, Weights(1.0, 5.0, sample_controls=False, **weight))
-        for weight in ({}, {"apart": 0.5})
+        OBJECTIVES["cab"](network, given, future, LossWeights(1.0, 5.0, sample_controls=False, **weight))
+        for weight in ({}, {"blind_kl": 0.5})
     )
     apart = released.terms["kl_full_blind"]
     assert apart > 0

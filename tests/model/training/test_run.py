@@ -17,12 +17,11 @@ from model.forecaster import Protocol
 from model.networks.config import BlindContext, CoverNetConfig, NetworkConfig
 from model.registry import Registry
 from model.scenes.scene import AgentType
-from model.training.calibration import MOST, Calibration
+from model.training.calibration import MAX_FACTOR, Calibration
 from model.training.card import RAN_AWAY
 from model.training.config import Method
-from model.training.logs import RunLog
 from model.training.run import Run, Source
-from model.training.state import Progress
+from model.training.state import Progress, RunLog
 from tests.model.data.records import FixedReader, record
 from tests.model.training.fakes import small_config
 
@@ -86,7 +85,7 @@ def test_what_was_calibrated_is_in_the_checkpoint_and_on_its_card(run: Run, meth
 def test_a_calibration_that_ran_away_is_said(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
     once = replace(run, config=small_config(Method.CAB, epochs=1))
-    monkeypatch.setattr("model.training.run.fit_calibration", lambda *_: Calibration(1.0, MOST))
+    monkeypatch.setattr("model.training.run.fit_calibration", lambda *_: Calibration(1.0, MAX_FACTOR))
     folder = once.train(lambda *_: None, lambda *_: None, said.append)
     assert any(RAN_AWAY in line for line in said)
     assert RAN_AWAY in (folder / "README.md").read_text()
@@ -156,12 +155,12 @@ def test_a_run_in_the_agents_frame_on_several_sources(run: Run, method: Method) 
         rotate=False,
         mirror=True,
         variants=1,
-        hide=True,
-        block=True,
+        context_dropout=True,
+        stopped_vehicles=True,
         jitter=True,
         keep="last",
         weight_decay=0.01,
-        leaving_share=0.5,
+        leaving_keep_probability=0.5,
     )
     source = replace(run.source, also=(("made", run.source.path, "some"),), report_split="some")
     own = replace(run, config=config, source=source)
@@ -177,12 +176,12 @@ def test_a_run_in_the_agents_frame_on_several_sources(run: Run, method: Method) 
         "Differs from the published network",
         "merged forecasts",
         "--also made:DATA@some",
-        "hide = true",
+        "context_dropout = true",
     ):
         assert told in card, told
     # What the card holds trains again
     settings = tomllib.loads(card.split("```toml\n")[1].split("```")[0])
-    assert settings["mixture"]["nearest"] == config.mixture.nearest
+    assert settings["mixture"]["min_ade"] == config.mixture.min_ade
     assert checkpoint.info.trained_on.count("split some") == 2
     # An interrupted run comes to the same, whatever was drawn
     first = replace(own, out=run.out.parent / "parts", config=config.model_copy(update={"epochs": 1}))

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from model.training.annealing import KL_SHARE, Z_LOGIT_CLIP, Sigmoid, cooldown, learning_rate
+from model.training.schedules import KL_SHARE, Z_LOGIT_CLIP, Sigmoid, cooldown, decayed
 
 
 def test_a_sigmoid_is_halfway_at_its_center_and_goes_from_start_to_end() -> None:
@@ -24,9 +24,9 @@ def test_the_released_schedules() -> None:
 
 
 def test_the_learning_rate_decays_to_a_floor() -> None:
-    assert learning_rate(0.003, 0) == 0.003
-    assert learning_rate(0.003, 1) == pytest.approx(0.003 * 0.9999)
-    assert learning_rate(0.003, 10**6) == 1e-5
+    assert decayed(0.003, 0) == 0.003
+    assert decayed(0.003, 1) == pytest.approx(0.003 * 0.9999)
+    assert decayed(0.003, 10**6) == 1e-5
 
 
 def test_the_learning_rate_cools_down_at_the_end() -> None:

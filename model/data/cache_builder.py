@@ -1,0 +1,276 @@
+"""Building of caches (``model.data.cache``) from recorded scenes.
+
+A cache is written beside its place and moved there once it is complete. ``open_cache`` builds it only if
+there is none for the same settings, of the current ``cache_layout.FORMAT_VERSION``.
+"""
+
+import hashlib
+import shutil
+import uuid
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from model.arrays import Floats
+from model.data.cache import Cache
+from model.data.cache_layout import (
+    FILE_NAMES,
+    FORMAT_VERSION,
+    MANIFEST_FILE,
+    RASTERS_FILE,
+    SCENE_LAYOUT,
+    Arrays,
+    CacheKey,
+    Layout,
+    Manifest,
+    pair_layout,
+)
+from model.data.checks import FUTURE_STEPS, check_pairs, check_raster
+from model.data.packing import pack, pack_patches
+from model.data.protocols import SceneFrames
+from model.data.scenes import DataError, Reader, SceneRecord
+from model.data.sensing import SensedFrames
+from model.features.agent_features import agent_frame_features
+from model.features.scene_features import network_features
+from model.features.spec import Frame
+from model.forecaster import Context, Protocol
+from model.geometry import wrap_angle
+from model.networks.config import AnyNetworkConfig, NetworkConfig
+from model.scenes.raster import FAR, NEAR, cut_patches
+from model.scenes.scene import AgentType, Raster
+
+
+def open_cache(
+    folder: Path,
+    reader: Reader,
+    kind: str,
+    split: str,
+    protocol: Protocol,
+    config: AnyNetworkConfig,
+    history_frames: int,
+    on_message: Callable[[str], None],
+    variants: int = 0,
+) -> Cache:
+    """Return the cache of a split; build it first if it is missing or stale.
+
+    Args:
+        folder: folder of the caches, which runs share.
+        reader: reader of the data.
+        kind: kind of the data, for the cache's name.
+        split: one of the reader's splits.
+        protocol: protocol of the inputs.
+        config: configuration of the network, which determines how neighbours are held.
+        history_frames: F, frames of history, now included.
+        on_message: called with a text if the cache is built, with the reason.
+        variants: V, noisy reports of each pair (agent frame only).
+
+    Raises:
+        DataError: the data is bad, or there are no pairs.
+    """
+    key = CacheKey.of(reader, split, protocol, config, history_frames, variants)
+    kinds = "".join(one.value[0] for one in key.neighbor_types) or "none"
+    # The place of the data is in the name, so that data sets do not replace each other's caches
+    data = hashlib.sha256(key.data.encode()).hexdigest()[:8]
+    form = f"-agent{variants}" if key.agent_frame else "-drawn" * key.drawn
+    place = folder / f"{kind}-{data}-{split}-{protocol.value}-{history_frames}-{kinds}{form}"
+    try:
+        return Cache.open(place, key)
+    except DataError as error:
+        on_message(f"building the cache of {split}: {error}")
+    build_cache(reader, split, protocol, config, history_frames, place, variants=variants)
+    return Cache.open(place, key)
+
+
+def build_cache(
+    reader: Reader,
+    split: str,
+    protocol: Protocol,
+    config: AnyNetworkConfig,
+    history_frames: int,
+    folder: Path,
+    progress: Callable[[SceneRecord], None] | None = None,
+    variants: int = 0,
+) -> None:
+    """Write the cache of a split; an existing one is replaced once the new one is complete.
+
+    Args:
+        reader: reader of the scenes.
+        split: one of the reader's splits.
+        protocol: protocol of the inputs.
+        config: configuration of the network, which determines how neighbours are held.
+        history_frames: F, frames of history, now included.
+        folder: folder of the cache; created, with its parents, if it does not exist.
+        progress: called after each scene.
+        variants: V, noisy reports of each pair beside the recorded states (agent frame only).
+
+    Raises:
+        DataError: the data is bad, there are no pairs, or the folder holds something else.
+    """
+    if folder.exists() and not (folder / MANIFEST_FILE).is_file():
+        raise DataError(f"{folder}: exists and is no cache; it is left alone")
+    key = CacheKey.of(reader, split, protocol, config, history_frames, variants)
+    # Patches are cut from the rasters: for each batch, or, in the agent's frame, here for all variants
+    config = config.model_copy(update={"uses_map": False})
+    with _replacing(folder) as new:
+        pairs: list[Arrays] = []
+        scenes: list[Arrays] = []
+        names: list[str] = []
+        written = 0
+        with (new / RASTERS_FILE).open("wb") as rasters:
+            for record in reader.scenes(split):
+                check_pairs(record.name, record.tracks, record.pairs)
+                check_raster(record.name, record.raster)
+                make = _agent_frame_arrays if key.agent_frame else _pair_arrays
+                pairs.append(make(record, len(names), protocol, config, history_frames, variants))
+                scenes.append(_scene_arrays(record.raster, written))
+                names.append(record.name)
+                written += rasters.write(pack(record.raster).data)
+                if progress is not None:
+                    progress(record)
+        if not pairs:
+            raise DataError(f"the split {split!r} has no pairs")
+        _save(new, pairs, pair_layout(key))
+        _save(new, scenes, SCENE_LAYOUT)
+        manifest = Manifest(
+            format_version=FORMAT_VERSION,
+            key=key,
+            pairs=sum(len(part["frame"]) for part in pairs),
+            scenes=tuple(names),
+            raster_bytes=written,
+        )
+        (new / MANIFEST_FILE).write_text(manifest.model_dump_json(indent=2) + "\n", encoding="utf-8")
+
+
+def _agent_frame_arrays(
+    record: SceneRecord,
+    scene: int,
+    protocol: Protocol,
+    config: AnyNetworkConfig,
+    history_frames: int,
+    variants: int,
+) -> Arrays:
+    """Return the rows of a scene's pairs in the agents' frames; those of a pair are consecutive."""
+    network = NetworkConfig(frame=Frame.AGENT, uses_map=False)
+    recorded = SceneFrames(record, protocol, history_frames)
+    sensed = SensedFrames(record, history_frames, seed=zlib.crc32(record.name.encode()))
+    frame = np.array([pair.frame for pair in record.pairs], dtype=np.int64)
+    track = np.array([pair.track for pair in record.pairs], dtype=np.int64)
+    rows = 1 + variants
+    parts: list[Arrays] = []
+    for now in np.unique(frame):  # the pairs are in this order
+        reports = []
+        for variant in range(rows):
+            seen, tracks = sensed.at(int(now), variant) if variant else recorded.at(int(now))
+            targets = np.searchsorted(tracks, track[frame == now])
+            report = agent_frame_features(seen, targets, network.features, Context.FULL)
+            reports.append({name: tensor.numpy() for name, tensor in report.items()})
+        part: Arrays = {  # [pairs · rows, …]
+            name: np.stack([one[name] for one in reports], axis=1).reshape(-1, *reports[0][name].shape[1:])
+            for name in reports[0]
+        }
+        part["position"], part["agents"] = part.pop("origin"), part.pop("neighbors")
+        for name, geometry in (("near_patch", NEAR), ("far_patch", FAR)):
+            patches = cut_patches(record.raster, part["position"], part["heading"], geometry, outside=0.5)
+            part[name] = pack_patches(patches)
+        parts.append(part)
+    arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    future, turn = _paths(record, history_frames)
+    recorded_now = np.array(
+        [record.tracks[pair.track].positions(np.array(pair.frame)) for pair in record.pairs]
+    )
+    arrays["future"] = np.repeat(future + recorded_now[:, None], rows, axis=0) - arrays["position"][:, None]
+    of_pairs = {
+        "turn": turn,
+        "scene": np.full(len(frame), scene),
+        "track": track,
+        "frame": frame,
+        "token": np.array([pair.token.encode("ascii") for pair in record.pairs], dtype=np.bytes_),
+    }
+    arrays |= {name: np.repeat(values, rows, axis=0) for name, values in of_pairs.items()}
+    count = len(arrays["position"])
+    return arrays | {"velocity": np.zeros((count, 2)), "edge_mask": np.zeros(count)}
+
+
+def _pair_arrays(
+    record: SceneRecord,
+    scene: int,
+    protocol: Protocol,
+    config: AnyNetworkConfig,
+    history_frames: int,
+    variants: int,
+) -> Arrays:
+    """Return the rows of a scene's pairs in the ground frame, one a pair."""
+    scenes = SceneFrames(record, protocol, history_frames)
+    frame = np.array([pair.frame for pair in record.pairs], dtype=np.int64)
+    track = np.array([pair.track for pair in record.pairs], dtype=np.int64)
+    parts: list[Arrays] = []
+    for now in np.unique(frame):  # the pairs are in this order
+        seen, tracks = scenes.at(int(now))
+        targets = np.searchsorted(tracks, track[frame == now])
+        features = network_features(seen, targets, AgentType.VEHICLE, config.features, Context.FULL)
+        part: Arrays = {name: tensor.numpy() for name, tensor in features.items()}
+        part["position"] = part.pop("origin")
+        part["heading"] = seen.states.heading[targets, -1]
+        part.setdefault("edge_mask", np.zeros(len(targets)))
+        parts.append(part)
+    future, turn = _paths(record, history_frames)
+    arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return arrays | {
+        "future": future,
+        "turn": turn,
+        "scene": np.full(len(frame), scene),
+        "track": track,
+        "frame": frame,
+        "token": np.array([pair.token.encode("ascii") for pair in record.pairs], dtype=np.bytes_),
+    }
+
+
+def _paths(record: SceneRecord, history_frames: int) -> tuple[Floats, Floats]:
+    """Return the pairs' future [P, 12, 2], m, relative to now, and turn [P], rad."""
+    future = np.empty((len(record.pairs), FUTURE_STEPS, 2))
+    turn = np.empty(len(record.pairs))
+    for row, pair in enumerate(record.pairs):
+        track = record.tracks[pair.track]
+        now = int(np.searchsorted(track.frames, pair.frame))
+        start = int(np.searchsorted(track.frames, pair.frame - history_frames + 1))
+        end = now + FUTURE_STEPS + 1
+        future[row] = track.position[now + 1 : end] - track.position[now]
+        turn[row] = abs(wrap_angle(np.diff(track.heading[start:end])).sum())
+    return future, turn
+
+
+def _scene_arrays(raster: Raster, start: int) -> Arrays:
+    return {
+        "raster_start": np.array([start]),
+        "raster_shape": np.array([raster.layers.shape[1:]]),
+        "raster_origin": raster.origin[None],
+        "raster_pixels_per_meter": np.array([raster.pixels_per_meter]),
+    }
+
+
+def _save(folder: Path, parts: list[Arrays], layout: Layout) -> None:
+    for name, (dtype, _) in layout.items():
+        joined = np.concatenate([part[name] for part in parts])
+        # Strings keep the length of the longest one
+        file = folder / f"{FILE_NAMES.get(name, name)}.npy"
+        np.save(file, joined if dtype is np.bytes_ else joined.astype(dtype))
+
+
+@contextmanager
+def _replacing(folder: Path) -> Iterator[Path]:
+    """Yield a new folder that replaces ``folder`` on success and is removed otherwise."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    mark = uuid.uuid4().hex[:12]
+    new, old = (folder.with_name(f".{folder.name}.{mark}.{what}") for what in ("new", "old"))
+    new.mkdir()
+    try:
+        yield new
+        if folder.exists():
+            folder.rename(old)
+        new.rename(folder)
+    finally:
+        for leftover in (new, old):
+            shutil.rmtree(leftover, ignore_errors=True)
