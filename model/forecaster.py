@@ -105,7 +105,7 @@ class Forecaster(ABC):
         """Whether forecasts of agents of that type depend on the map."""
         return self.info.uses_map
 
-    def looks_far(self, agent_type: AgentType) -> bool:
+    def looks_at_far_map(self, agent_type: AgentType) -> bool:
         """Whether forecasts of agents of that type depend on a far map patch, too."""
         return False
 

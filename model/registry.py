@@ -1,8 +1,9 @@
-"""Every model that can forecast here, by name and version."""
+"""The models that can forecast, by name and version."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
@@ -12,16 +13,22 @@ if TYPE_CHECKING:
     from model.checkpoint import Checkpoint
     from model.forecaster import Forecaster, ModelInfo
 
-# Models are imported when a registry is made: what only names a registry need not wait for torch.
+# Models are imported when a registry is made, so that importing this module does not load torch.
+
+_BASELINES = (
+    "model.baselines.physics",
+    "model.baselines.kalman",
+)
+"""Modules of the models that need no checkpoint. Each has a function ``baselines()`` that returns them."""
 
 
 class UnknownModelError(LookupError):
-    """There is no such model; the message lists those that there are.
+    """An unknown model; the message lists the available ones.
 
     Args:
-        name: what was asked for.
-        available: what there is.
-        passed_over: what is called so but was left out, because it is of the paper protocol.
+        name: the requested name.
+        available: names of the models in the registry.
+        passed_over: models of that name that were not loaded because they are of the paper protocol.
     """
 
     def __init__(self, name: str, available: Sequence[str], passed_over: Sequence[str] = ()) -> None:
@@ -34,18 +41,18 @@ class UnknownModelError(LookupError):
 
 
 class DuplicateModelError(ValueError):
-    """Two models have the same name and version."""
+    """Two models of the same name and version."""
 
 
 class Registry:
-    """Models by ``name@version``; of a name alone, the newest version of the causal protocol.
+    """Models by ``name@version``; a name alone means its newest version of the causal protocol.
 
     Args:
         forecasters: the models.
-        passed_over: models that were found but left out, because of their protocol.
+        passed_over: models that were found but not loaded because of their protocol.
 
     Raises:
-        DuplicateModelError: two have the same name and version.
+        DuplicateModelError: two models have the same name and version.
     """
 
     def __init__(self, forecasters: Iterable[Forecaster], passed_over: Iterable[ModelInfo] = ()) -> None:
@@ -60,17 +67,17 @@ class Registry:
 
     @classmethod
     def load(cls, models: Path | None, allow_paper: bool = False) -> Registry:
-        """The baselines, and the checkpoints of a folder.
+        """Load the baselines and the checkpoints of a folder.
 
         Args:
-            models: the folder of ``load_checkpoints``; None: no checkpoints.
-            allow_paper: whether models of the paper protocol are welcome. Such a model was trained on
-                states that contain the near future, and forecasts worse than it should on live ones:
-                it is for reproducing published tables. Without it they are ``passed_over``, if there are
-                others; a folder of nothing else is an error, as nobody can have meant that.
+            models: the folder, as ``load_checkpoints`` takes it; None: no checkpoints.
+            allow_paper: whether to load models of the paper protocol. Such a model was trained on states
+                that contain the near future, and its forecasts from live states are worse than its
+                published figures; it is for reproducing published tables. If False, such models are
+                ``passed_over``, and a folder with nothing else is an error.
 
         Raises:
-            CheckpointError: a checkpoint is damaged, or all are of the paper protocol while that is not
+            CheckpointError: a checkpoint is damaged, or all are of the paper protocol and that is not
                 allowed.
             DuplicateModelError: two models have the same name and version.
         """
@@ -83,17 +90,17 @@ class Registry:
                 passed_over.append(checkpoint)
         if passed_over and not allowed:
             _refuse(passed_over[0])
-        return cls([*_baselines(), *allowed], [checkpoint.info for checkpoint in passed_over])
+        return cls([*baselines(), *allowed], [checkpoint.info for checkpoint in passed_over])
 
     def get(self, name: str) -> Forecaster:
-        """A model.
+        """Return a model.
 
         Args:
-            name: ``name`` or ``name@version``. Of a name alone: its newest version of the causal protocol,
-                or where it has none, its newest.
+            name: ``name`` or ``name@version``. A name alone means its newest version of the causal
+                protocol, or its newest version if none is causal.
 
         Raises:
-            UnknownModelError: there is none.
+            UnknownModelError: there is no such model.
         """
         base, pinned, version = name.partition("@")
         versions = self._models.get(base, {})
@@ -106,7 +113,7 @@ class Registry:
             raise UnknownModelError(name, [info.full_name for info in self.infos()], namesakes) from None
 
     def infos(self) -> list[ModelInfo]:
-        """What is known of each model, by name, then by version, oldest first."""
+        """Return the infos of all models, by name, then by version, oldest first."""
         return [
             versions[version].info
             for _, versions in sorted(self._models.items())
@@ -114,7 +121,7 @@ class Registry:
         ]
 
     def __contains__(self, name: object) -> bool:
-        """Whether ``get`` finds a model of that name."""
+        """Return whether ``get`` finds a model of that name."""
         if not isinstance(name, str):
             return False
         try:
@@ -125,22 +132,19 @@ class Registry:
 
 
 def _is_causal(info: ModelInfo) -> bool:
-    return info.protocol.value == "causal"  # the enumeration would bring torch along
+    return info.protocol.value == "causal"  # comparing with the enumeration would import torch
 
 
-def _baselines() -> Iterator[Forecaster]:
-    """What needs no checkpoint. A new baseline is a line here."""
-    from model.baselines import kalman, physics  # noqa: PLC0415 (see above)
-
-    yield from physics.baselines()
-    yield kalman.Kalman()
+def baselines() -> list[Forecaster]:
+    """Return the models that need no checkpoint."""
+    return [forecaster for module in _BASELINES for forecaster in import_module(module).baselines()]
 
 
 def load_checkpoints(folder: Path) -> Iterator[Checkpoint]:
-    """The checkpoints in a folder, by the names of their folders.
+    """Yield the checkpoints in a folder, in the order of their folders' names.
 
     Args:
-        folder: every folder in it that does not begin with a dot is a checkpoint.
+        folder: a folder of checkpoints: each folder in it whose name does not begin with a dot is one.
 
     Raises:
         CheckpointError: there is no such folder, or a checkpoint is damaged.
@@ -160,6 +164,6 @@ def _refuse(checkpoint: Checkpoint) -> NoReturn:
     raise CheckpointError(
         checkpoint.folder,
         f"{checkpoint.info.full_name} is of the paper protocol, and there is no other checkpoint: it was "
-        "trained on states that contain the near future, which a live service cannot see; load it, with "
-        "--allow-paper-protocol, only to reproduce published tables",
+        "trained on states that contain the near future, which a live service cannot see; load it with "
+        "--allow-paper-protocol, but only to reproduce published tables",
     )

@@ -5,7 +5,7 @@ State: position and velocity. Between frames the acceleration is white noise (Ba
 white noise. The axes are independent and alike, so one 2 × 2 covariance of (position, velocity) serves both.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -133,6 +133,11 @@ class Kalman(Forecaster):
         variance = _predict(state, time, density).var_position  # [N, T]
         covariance = torch.diag_embed(variance[..., None].expand(-1, -1, 2))
         return unimodal(mean, covariance, features["origin"])
+
+
+def baselines() -> Sequence[Forecaster]:
+    """Return the filter, for the registry."""
+    return (Kalman(),)
 
 
 @dataclass(frozen=True)

@@ -119,7 +119,7 @@ class Physics(Forecaster):
 
 
 def baselines() -> Sequence[Physics]:
-    """The four of nuScenes."""
+    """Return the four physics baselines of nuScenes, for the registry."""
     return (
         Physics("constant-velocity-yaw", False, False, uncertainty.CONSTANT_VELOCITY_YAW),
         Physics("constant-speed-yaw-rate", False, True, uncertainty.CONSTANT_SPEED_YAW_RATE),

@@ -9,8 +9,8 @@ import torch
 
 from model.checkpoint import save_checkpoint
 from model.convert.errors import ConversionError
-from model.convert.legacy import read_parameters
-from model.convert.names import rename
+from model.convert.tensor_names import rename
+from model.convert.torch_legacy import read_parameters
 from model.forecaster import ModelInfo, Protocol
 from model.networks.config import BlindContext, NetworkConfig
 from model.networks.forecaster import CvaeForecaster

@@ -4,12 +4,11 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from model.baselines import kalman, physics
 from model.checkpoint import Checkpoint
 from model.forecaster import Forecaster, ModelInfo, Protocol
 from model.metrics.oracle import ORACLE
 from model.networks.config import AnyNetworkConfig
-from model.registry import load_checkpoints
+from model.registry import baselines, load_checkpoints
 from model.scenes.scene import AgentType
 
 
@@ -65,8 +64,8 @@ def choose(folder: Path | None, protocol: Protocol, only: Collection[str] = ()) 
     """
     checkpoints = [] if folder is None else list(load_checkpoints(folder))
     fitting = [one for one in checkpoints if _fits(one, protocol)]
-    baselines = [*physics.baselines(), kalman.Kalman()]
-    infos = [*(one.info for one in baselines), *(one.info for one in fitting)]
+    candidates = baselines()
+    infos = [*(one.info for one in candidates), *(one.info for one in fitting)]
     _check_names(infos, protocol, only)
     if not fitting and not only:
         where = "no folder of checkpoints is given, and none are bundled" if folder is None else str(folder)
@@ -76,7 +75,7 @@ def choose(folder: Path | None, protocol: Protocol, only: Collection[str] = ()) 
             + (f"; there are {others}" if others else "")
         )
     return Subjects(
-        tuple(one for one in baselines if _wanted(one.info, only)),
+        tuple(one for one in candidates if _wanted(one.info, only)),
         not only or ORACLE in only,
         tuple(Learned(one.network, one.forecaster()) for one in fitting if _wanted(one.info, only)),
     )

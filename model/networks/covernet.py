@@ -41,7 +41,7 @@ class CoverNet(nn.Module):
     """
 
     cover: Tensor
-    """[M, T, 2], m, x ahead and y to the left of the agent now."""
+    """The buffer of ``trajectory_set``, under the name that it has in checkpoints."""
     variance: Tensor
     """[T, 2], m², of the truth about its member, ahead and to the left; after calibration, of a forecast."""
 
@@ -58,6 +58,11 @@ class CoverNet(nn.Module):
         self.logits = nn.Linear(_HIDDEN, config.members)
         self.register_buffer("cover", torch.zeros(config.members, config.steps, 2))
         self.register_buffer("variance", torch.ones(config.steps, 2))
+
+    @property
+    def trajectory_set(self) -> Tensor:
+        """[M, T, 2], m, x ahead and y to the left of the agent now."""
+        return self.cover
 
     def scores(self, features: Features) -> Tensor:
         """Logits of all members: [N, M]."""
@@ -82,7 +87,7 @@ class CoverNet(nn.Module):
             raise ValueError(f"this network's trajectories have {self.config.steps} steps, not {steps}")
         logits, likeliest = self.scores(features).topk(self.config.modes, dim=1)
         heading = present_heading(features)
-        mean = turned(self.cover[likeliest, :steps], heading)
+        mean = turned(self.trajectory_set[likeliest, :steps], heading)
         along, across = self.variance[:steps].unbind(dim=1)
         covariance = oriented_covariance(along, across, heading[:, None].expand(-1, steps))
         shared = covariance[:, None].expand(-1, self.config.modes, -1, -1, -1)

@@ -17,7 +17,7 @@ from model.mixture import TrajectoryMixture
 from model.networks.agent_frame import AgentFrameNetwork
 from model.networks.config import AnyNetworkConfig, CoverNetConfig, NetworkConfig
 from model.networks.covernet import CoverNet
-from model.networks.network import AgentNetwork
+from model.networks.cvae import AgentNetwork
 from model.scenes.scene import AgentType, Scene
 
 MIN_VARIANCE = 1e-6
@@ -82,7 +82,7 @@ class NetworkForecaster(Forecaster, Generic[SomeNetworks]):
         """Vehicles only, if at all."""
         return self.config.looks_at_map(agent_type)
 
-    def looks_far(self, agent_type: AgentType) -> bool:
+    def looks_at_far_map(self, agent_type: AgentType) -> bool:
         """Vehicles only, in the agent's frame."""
         return (
             self.looks_at_map(agent_type) and isinstance(self.config, NetworkConfig) and self.config.far_map

@@ -3,7 +3,7 @@
 Causal: a grid state depends on what was observed up to the present, never on the future (REFERENCE:
 the papers' released preprocessing differentiates centrally over whole tracks; a live service cannot).
 At 2 Hz what an observation gives is used as it is, and what it does not give is derived by backward
-differences. Denser observations are evidence, to which the states are fitted (``model.scenes.fit``); in
+differences. Denser observations are evidence, to which the states are fitted (``model.scenes.state_fit``); in
 between, from 2.5 to some 4.5 Hz, the one passes over into the other.
 """
 
@@ -14,9 +14,9 @@ import numpy as np
 
 from model.arrays import Bools, Floats, Ints
 from model.geometry import wrap_angle
-from model.scenes.fit import MIN_HEADING_SPEED, Fitted, fit
 from model.scenes.observations import Observations
 from model.scenes.scene import STEP_SECONDS, AgentStates
+from model.scenes.state_fit import MIN_HEADING_SPEED, FittedStates, fit_states
 
 TIME_TOLERANCE = 1e-4
 """s; an observation this near to a grid time stands for it (3 mm at 30 m/s)."""
@@ -48,8 +48,8 @@ def resample(observations: Observations, time: float, frames: int) -> AgentState
     replaced by the direction of motion.
 
     Where observations are denser, position, velocity, acceleration, heading and heading rate are those of a
-    fit to the observations within ``model.scenes.fit.WINDOW`` before the grid time and, up to the present,
-    after it. Given velocities, accelerations and heading rates are measurements like others. So is the course
+    fit to the observations within ``model.scenes.state_fit.WINDOW`` before the grid time and,
+    up to the present, after it. Given derivatives are measurements like others. So is the course
     over ground, for the heading of what moves; an agent that reverses keeps its headings.
 
     A heading that is not given is the direction of motion from ``MIN_HEADING_SPEED`` on (the opposite one
@@ -74,7 +74,7 @@ def resample(observations: Observations, time: float, frames: int) -> AgentState
     states = _as_observed(seen, time, count, carried).last_frames(frames)
     times = _grid(np.full(len(newest), time), states.frames)
     times[carried, -1] = newest[carried]
-    return _fitted(states, fit(seen, times), np.where(carried, age, 0.0))
+    return _fitted(states, fit_states(seen, times), np.where(carried, age, 0.0))
 
 
 def history_seconds(frames: int) -> float:
@@ -135,7 +135,7 @@ def _as_observed(obs: Observations, time: float, count: int, carried: Bools) -> 
     return replace(states, velocity_known=_last_velocity_known(obs) & (states.first < count))
 
 
-def _fitted(states: AgentStates, fitted: Fitted, ahead: Floats) -> AgentStates:
+def _fitted(states: AgentStates, fitted: FittedStates, ahead: Floats) -> AgentStates:
     """Goes from states as observed to fitted ones as far as the fit's share says; without it, not a bit.
 
     Args:

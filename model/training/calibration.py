@@ -24,9 +24,9 @@ from model.metrics.density import LABEL_NOISE_M, nll
 from model.mixture import TrajectoryMixture, merge_modes
 from model.networks.agent_frame import AgentFrameNetwork, Modes
 from model.networks.covernet import CoverNet, turned
+from model.networks.cvae import AgentNetwork
 from model.networks.decoder import ModeDecoder
 from model.networks.forecaster import network_mixture
-from model.networks.network import AgentNetwork
 from model.training.sampling import BatchSource
 
 PAIRS: Final = 2048

@@ -47,7 +47,7 @@ class CoverNetLearner(DescentLearner):
         known = shape.model_copy(update={"members": count, "modes": min(count, shape.modes)})
         networks = CoverNetworks(known)
         self.network = networks.of(AgentType.VEHICLE)
-        self.network.cover.copy_(trajectories.members)
+        self.network.trajectory_set.copy_(trajectories.members)
         self.network.variance.copy_(trajectories.variance)
         super().__init__(config, networks.to(device))
 
@@ -55,7 +55,7 @@ class CoverNetLearner(DescentLearner):
         (batch,) = batches
         with torch.no_grad():
             path = turned(batch.future, -present_heading(batch.features))
-            distances = summed_distances(path, self.network.cover)
+            distances = summed_distances(path, self.network.trajectory_set)
             nearest = distances.argmin(dim=1)
         scores = self.network.scores(batch.features)
         loss = F.cross_entropy(scores, nearest)

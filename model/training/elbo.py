@@ -13,7 +13,7 @@ from torch import Tensor
 from model.features.standardization import FUTURE_POSITION_SCALE
 from model.forecaster import Context, Features
 from model.mixture import guarded_log_density
-from model.networks.network import AgentNetwork
+from model.networks.cvae import AgentNetwork
 
 MIN_KL = 0.07
 """nats, lower clamp of the divergence (free bits)."""

@@ -13,10 +13,10 @@ from model.forecaster import Features
 from model.networks.agent_frame import AgentFrameNetwork
 from model.networks.config import NetworkConfig
 from model.networks.covernet import turned
+from model.networks.cvae import AgentNetwork
 from model.networks.decoder import ModeDecoder
 from model.networks.encoders import MapEncoder
 from model.networks.forecaster import CvaeNetworks, Networks
-from model.networks.network import AgentNetwork
 from model.scenes.scene import AgentType
 from model.training.config import Method, Precision, TrainingConfig
 from model.training.mixture_objective import mixture_objective

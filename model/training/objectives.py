@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from model.forecaster import Context, Features
-from model.networks.network import AgentNetwork
+from model.networks.cvae import AgentNetwork
 from model.training.elbo import (
     ContextTerms,
     clamped_divergence,

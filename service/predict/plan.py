@@ -251,7 +251,7 @@ def _warnings(plan: Plan) -> list[str]:
                 f"{info.name} uses the map, but none was given for {without} of {len(own)} agents: "
                 "it saw an unknown one"
             )
-        far = [draft for draft in own if plan.forecaster.looks_far(scene.types[draft.row])]
+        far = [draft for draft in own if plan.forecaster.looks_at_far_map(scene.types[draft.row])]
         without_far = sum(draft.row not in scene.far_patches for draft in far)
         if without_far and without_far > without:
             warnings.append(

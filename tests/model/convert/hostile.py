@@ -121,7 +121,7 @@ HOSTILE: Mapping[str, Hostile] = {
 
 def _outcomes(folder: Path) -> Iterator[Outcome]:
     from model.convert.errors import ConversionError
-    from model.convert.legacy import read_parameters
+    from model.convert.torch_legacy import read_parameters
 
     for file in sorted(folder.iterdir()):
         size = _peak_megabytes()

@@ -11,8 +11,8 @@ import torch
 from model.checkpoint import load_checkpoint
 from model.convert import ConversionError, UnsafePickleError, convert_trajectron
 from model.forecaster import Context, Protocol
+from model.networks.cvae import AgentNetwork
 from model.networks.forecaster import CvaeForecaster
-from model.networks.network import AgentNetwork
 from model.scenes.scene import AgentType
 from tests.model.convert.assembler import call, legacy_file, module, named, text
 

@@ -30,7 +30,7 @@ def tensors(config: CoverNetConfig = CONFIG) -> dict[str, Tensor]:
     network = networks.of(AgentType.VEHICLE)
     speeds, drift = torch.rand(config.members, 1) * 5, torch.randn(config.members, 1)
     ahead = torch.arange(1.0, config.steps + 1)
-    network.cover.copy_(torch.stack([speeds * ahead, 0.1 * drift * ahead], dim=-1))
+    network.trajectory_set.copy_(torch.stack([speeds * ahead, 0.1 * drift * ahead], dim=-1))
     network.variance.copy_(torch.stack([0.5 * ahead, 0.1 * ahead], dim=-1))
     return dict(networks.state_dict())
 
@@ -51,7 +51,7 @@ def test_a_forecast_is_of_the_likeliest_members(model: CoverNetForecaster) -> No
     for row in range(6):
         order = scores[row].argsort(descending=True)[:25]
         torch.testing.assert_close(mixture.log_weights[row], torch.log_softmax(scores[row, order], dim=0))
-        wanted = rotate(network.cover[order].double().numpy(), headings[row])
+        wanted = rotate(network.trajectory_set[order].double().numpy(), headings[row])
         np.testing.assert_allclose(mixture.means[row].numpy(), wanted, atol=1e-4)
     assert (mixture.most_likely() == 0).all()
     short = model.forecast(features, AgentType.VEHICLE, steps=3)

@@ -20,11 +20,11 @@ from torch import Tensor
 
 from model.checkpoint import load_checkpoint
 from model.convert import convert_trajectron
-from model.convert.names import rename
+from model.convert.tensor_names import rename
 from model.forecaster import Context
 from model.networks.config import BlindContext, NetworkConfig
+from model.networks.cvae import AgentNetwork
 from model.networks.forecaster import CvaeNetworks
-from model.networks.network import AgentNetwork
 from model.scenes.scene import AgentType
 from tests.model.networks.ekf import unicycle
 from tests.model.networks.golden import TYPES, double, golden_features

@@ -12,8 +12,8 @@ from model.metrics.density import LABEL_NOISE_M, nll
 from model.mixture import TrajectoryMixture
 from model.networks.config import BlindContext, NetworkConfig
 from model.networks.covernet import CoverNet
+from model.networks.cvae import AgentNetwork
 from model.networks.dynamics import Positions
-from model.networks.network import AgentNetwork
 from model.scenes.scene import AgentType
 from model.training.calibration import (
     MAX_FACTOR,

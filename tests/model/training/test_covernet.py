@@ -27,7 +27,7 @@ def test_the_published_objective_is_cross_entropy_alone() -> None:
     learner, said = terms(0.0)
     given, future = PAIRS.batch(torch.arange(12))
     path = turned(future, -present_heading(given))
-    distance = (path[:, None] - learner.network.cover).norm(dim=-1).mean(-1)
+    distance = (path[:, None] - learner.network.trajectory_set).norm(dim=-1).mean(-1)
     with torch.no_grad():
         log_shares = learner.network.scores(given).log_softmax(-1)
     expected = -log_shares[torch.arange(12), distance.argmin(1)].mean().item()
@@ -43,7 +43,7 @@ def test_the_displacement_is_what_the_probabilities_expect() -> None:
         shares = learner.network.scores(given).softmax(-1)
     expected = 0.0
     for agent in range(12):
-        for share, member in zip(shares[agent].tolist(), learner.network.cover, strict=True):
+        for share, member in zip(shares[agent].tolist(), learner.network.trajectory_set, strict=True):
             expected += share * (path[agent] - member).norm(dim=-1).sum().item() / 12
     assert said["displacement"] == pytest.approx(expected, rel=1e-4)
     _, without = terms(0.0)

@@ -7,7 +7,7 @@ import torch
 
 from model.forecaster import Context
 from model.networks.config import NetworkConfig
-from model.networks.network import AgentNetwork
+from model.networks.cvae import AgentNetwork
 from model.scenes.scene import AgentType
 from model.training.config import Method
 from model.training.halentnet import FIRST_SWITCH, LAST_SWITCH, STEPS, HalentLearner

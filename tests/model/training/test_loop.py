@@ -244,10 +244,10 @@ def test_the_cover_of_covernet_is_of_the_training_paths(tmp_path: Path) -> None:
     trainer, _ = train(small_config(Method.COVERNET, epochs=1), tmp_path)
     network = trainer.networks.of(AgentType.VEHICLE)
     assert isinstance(network, CoverNet)
-    assert network.config.members == len(network.cover) > network.config.modes
-    same = (PAIRS.paths[:, None] == network.cover).all(dim=(2, 3))
+    assert network.config.members == len(network.trajectory_set) > network.config.modes
+    same = (PAIRS.paths[:, None] == network.trajectory_set).all(dim=(2, 3))
     assert same.any(dim=0).all()
-    farthest = (PAIRS.paths[:, None] - network.cover).norm(dim=-1).amax(dim=-1)
+    farthest = (PAIRS.paths[:, None] - network.trajectory_set).norm(dim=-1).amax(dim=-1)
     assert farthest.amin(dim=1).amax() <= network.config.epsilon + 1e-4
 
 

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from safetensors.torch import load_file
 from torch import Tensor
 
-from model.convert.names import our_name, rename
+from model.convert.tensor_names import our_name, rename
 from model.forecaster import Context, Features
-from model.networks import network as network_module
+from model.networks import cvae as network_module
 from model.networks.config import BlindContext, NetworkConfig
-from model.networks.network import AgentNetwork
+from model.networks.cvae import AgentNetwork
 from model.scenes.scene import AgentType
 from model.training.elbo import (
     MIN_KL,

@@ -5,7 +5,7 @@ import torch
 from safetensors.torch import load_file
 
 from model.convert.errors import ConversionError
-from model.convert.names import rename
+from model.convert.tensor_names import rename
 from model.networks.config import BlindContext, NetworkConfig
 from model.networks.forecaster import CvaeNetworks
 

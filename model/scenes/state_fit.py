@@ -84,7 +84,7 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FittedStates:
     """States of N agents at E times. Where the share is 0, the other values mean nothing."""
 
     share: Floats
@@ -135,7 +135,7 @@ class _Motion:
         return weight
 
 
-def fit(obs: Observations, times: Floats) -> Fitted:
+def fit_states(obs: Observations, times: Floats) -> FittedStates:
     """Fits states.
 
     Args:
@@ -167,7 +167,7 @@ def fit(obs: Observations, times: Floats) -> Fitted:
         fitted_heading, fitted_rate = _fit_heading(obs, given, weight, after, motion)
         heading = np.where(some, fitted_heading, heading)
         heading_rate = np.where(some, fitted_rate, heading_rate)
-    return Fitted(
+    return FittedStates(
         share.T,
         origin[:, None] + motion.position.T,
         motion.velocity.T,
@@ -178,10 +178,10 @@ def fit(obs: Observations, times: Floats) -> Fitted:
     )
 
 
-def _nothing(shape: tuple[int, ...]) -> Fitted:
+def _nothing(shape: tuple[int, ...]) -> FittedStates:
     zero, vectors = np.zeros(shape), np.zeros((*shape, 2))
     unknown = np.full(shape, np.nan)
-    return Fitted(zero, vectors, vectors, vectors, unknown, zero, unknown)
+    return FittedStates(zero, vectors, vectors, vectors, unknown, zero, unknown)
 
 
 def _first_axis(values: NDArray[_Scalar]) -> NDArray[_Scalar]:

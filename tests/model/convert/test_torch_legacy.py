@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from model.convert import legacy
+from model.convert import torch_legacy
 from model.convert.errors import ConversionError, UnsafePickleError
-from model.convert.legacy import read_parameters
+from model.convert.torch_legacy import read_parameters
 from tests.model.convert.assembler import (
     SYSTEM,
     call,
@@ -89,7 +89,7 @@ def test_todays_zip_files_are_told_apart(tmp_path: Path) -> None:
 def test_a_file_that_is_not_there_or_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ConversionError, match="cannot be read"):
         read_parameters(tmp_path / "nowhere.pt")
-    monkeypatch.setattr(legacy, "MAX_FILE_BYTES", 10)
+    monkeypatch.setattr(torch_legacy, "MAX_FILE_BYTES", 10)
     assert "too many" in _fault(tmp_path, legacy_file(*linear()))
 
 
@@ -178,8 +178,8 @@ def test_a_module_that_is_there_twice(tmp_path: Path) -> None:
 
 
 def test_the_number_of_modules_and_parameters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(legacy, "MAX_MODULES", 4)
-    monkeypatch.setattr(legacy, "MAX_PARAMETERS", 2)
+    monkeypatch.setattr(torch_legacy, "MAX_MODULES", 4)
+    monkeypatch.setattr(torch_legacy, "MAX_PARAMETERS", 2)
     one = module({"nothing": b"N"})
     assert (
         read_parameters(_write(tmp_path, legacy_file(module(modules={"a": one, "b": module(), "c": one}))))
