@@ -1,4 +1,4 @@
-# The serving image: what pyproject's dependencies name and nothing else, as a user without rights.
+# The serving image: the dependencies of pyproject.toml without extras, run as an unprivileged user.
 FROM python:3.11-slim AS build
 WORKDIR /src
 COPY pyproject.toml constraints.txt README.md LICENSE ./
@@ -8,7 +8,7 @@ COPY service service
 COPY cli cli
 COPY cab_forecast cab_forecast
 COPY benchmark benchmark
-# The CPU build of torch: the default one brings gigabytes of CUDA
+# The CPU build of torch; the default build adds gigabytes of CUDA libraries
 RUN python -m venv /opt/cab-forecast \
  && /opt/cab-forecast/bin/pip install --no-cache-dir --disable-pip-version-check \
       --extra-index-url https://download.pytorch.org/whl/cpu -c constraints.txt .
@@ -25,5 +25,5 @@ USER 10001
 EXPOSE 8080 50051
 HEALTHCHECK --interval=10s --timeout=3s --start-period=30s \
   CMD ["python", "-c", "import urllib.request; urllib.request.urlopen('http://127.0.0.1:8080/readyz', timeout=2)"]
-# SIGTERM drains
+# On SIGTERM the server drains and stops
 CMD ["cab-forecast", "serve"]

@@ -1,4 +1,4 @@
-# One target a task; `make run` and `make test` do all set-up that they need.
+# One target per task. Each target sets up what it needs.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -16,15 +16,15 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) -c constraints.txt -e ".[dev]"
 	touch $@
 
-install: $(VENV)/.installed  ## make .venv with everything
+install: $(VENV)/.installed  ## create .venv with the package and the dev extra
 
-run: install  ## serve on 127.0.0.1:8080 (REST) and :50051 (gRPC); print one forecast
+run: install  ## serve on 127.0.0.1:8080 (REST) and 127.0.0.1:50051 (gRPC), and print one forecast
 	$(BIN)/cab-forecast serve --demo
 
-test: install lint proto-check  ## lint, types, drift of the generated code, all tests
+test: install lint proto-check  ## lint, check types and generated code, run all tests
 	$(BIN)/python -m pytest
 
-# nuscenes-devkit needs numpy < 2, so it has an environment of its own, with all other pins.
+# nuscenes-devkit needs numpy < 2, so it has its own environment, with all other pins of constraints.txt.
 $(NUSCENES)/.installed: pyproject.toml constraints.txt
 	test -x $(NUSCENES)/bin/python || $(PYTHON) -m venv $(NUSCENES)
 	grep -v '^numpy==' constraints.txt > $(NUSCENES)/constraints.txt
@@ -32,46 +32,46 @@ $(NUSCENES)/.installed: pyproject.toml constraints.txt
 	  -c $(NUSCENES)/constraints.txt -e ".[benchmark,dev]"
 	touch $@
 
-test-nuscenes: $(NUSCENES)/.installed  ## tests that need nuscenes-devkit, in .venv-nuscenes
+test-nuscenes: $(NUSCENES)/.installed  ## run the tests that need nuscenes-devkit, in .venv-nuscenes
 	$(NUSCENES)/bin/python -m pytest tests/model/data/test_nuscenes.py tests/model/metrics/test_devkit.py \
 	  tests/benchmark/test_submission.py tests/benchmark/test_official.py
 
-lint: install
+lint: install  ## check style, formatting, types and the directions of imports
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
 
-format: install
+format: install  ## fix style and formatting
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench: install  ## speed of the forward against this process's own matmul rate; start and memory of the server; cost of tracking
+bench: install  ## measure the forward pass (relative to matmul), startup time, memory, and the cost of tracking
 	$(BIN)/python -m loadtest.forward
 	$(BIN)/python -m loadtest.startup
 	$(BIN)/python -m loadtest.tracking
 
-faults: install  ## forecasts while the track memory is killed, full, slow and hanging; needs redis-server
+faults: install  ## forecast while the track memory is killed, full, slow or hanging; needs redis-server
 	$(BIN)/python -m loadtest.faults
 
-docs: install  ## renew the generated parts of docs/: settings, tables of figures
+docs: install  ## generate the tables of settings and metrics in docs/
 	$(BIN)/python -m docs.generate
 
-proto: install  ## generate Python from proto/
+proto: install  ## generate the Python code from proto/
 	$(PROTOC) -Iproto --python_out=proto --mypy_out=proto --grpc_python_out=proto \
 	  --mypy_grpc_out=proto $(PROTOS)
 
-proto-check: install  ## fail when the generated code is not what proto/ gives
+proto-check: install  ## fail if the generated code differs from proto/
 	@tmp=$$(mktemp -d) && trap 'rm -rf "$$tmp"' EXIT && \
 	$(PROTOC) -Iproto --python_out=$$tmp --mypy_out=$$tmp --grpc_python_out=$$tmp \
 	  --mypy_grpc_out=$$tmp $(PROTOS) && \
 	diff -r -x '*.proto' -x __init__.py -x __pycache__ -x py.typed -x bounds.py -x routes.py $$tmp/cab proto/cab && echo "generated code is up to date"
 
-proto-lint:  ## buf lint; needs node
+proto-lint:  ## run buf lint; needs node
 	$(BUF) lint
 
-lock: install  ## write constraints.txt anew from what is installed
+lock: install  ## write the installed versions to constraints.txt
 	$(BIN)/python -m pip freeze --exclude-editable | sed 's/+cpu$$//' > constraints.txt
 
-clean:
+clean:  ## remove the environments and caches
 	rm -rf $(VENV) $(NUSCENES) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
