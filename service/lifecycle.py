@@ -1,4 +1,4 @@
-"""Lifecycle of a server: starting, ready, draining."""
+"""Lifecycle of a server: starting, ready, draining, failed."""
 
 import asyncio
 from collections.abc import Iterator
@@ -14,6 +14,7 @@ class Phase(StrEnum):
     STARTING = "starting"
     READY = "ready"
     DRAINING = "draining"
+    FAILED = "ending after a failure"
 
 
 class Lifecycle:
@@ -24,6 +25,8 @@ class Lifecycle:
         self._calls = 0
         self._idle = asyncio.Event()
         self._idle.set()
+        self.failed = asyncio.Event()
+        """Event that is set by ``fail``."""
 
     @property
     def phase(self) -> Phase:
@@ -42,13 +45,19 @@ class Lifecycle:
 
     def refuse(self) -> None:
         """Accept no more calls."""
-        self._phase = Phase.DRAINING
+        if self._phase is not Phase.FAILED:
+            self._phase = Phase.DRAINING
+
+    def fail(self) -> None:
+        """Accept no more calls: the server can answer none any more and must end."""
+        self._phase = Phase.FAILED
+        self.failed.set()
 
     def require_ready(self) -> None:
         """Refuse a call unless the server is ready.
 
         Raises:
-            Unavailable: the server is starting or draining.
+            Unavailable: the server is starting, draining or failed.
         """
         if self._phase is not Phase.READY:
             raise Unavailable(f"the server is {self._phase.value}")

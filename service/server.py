@@ -11,7 +11,7 @@ import structlog
 from model.checkpoint import CheckpointError
 from model.registry import DuplicateModelError, Registry
 from service.predict.catalog import Models
-from service.predict.pipeline import DataPlane
+from service.predict.dataplane import DataPlane
 from service.settings import Settings, SettingsError, bundled_models
 from service.telemetry.metrics import Metrics
 from service.transports.grpc.server import GrpcServer

@@ -1,16 +1,16 @@
-"""One queue in front of the model: calls that wait at the same time ride in one batch.
+"""Dynamic batching: calls that wait for the model at the same time share a forward.
 
-A batch leaves as soon as the model is free and never waits for company: under light load a call runs
-alone, under heavy load batches grow by themselves. Everything here but the forward itself runs on the
-event loop, so there are no locks.
+A batch starts as soon as the model is free and never waits for more calls: under light load a call runs
+alone, under heavy load batches grow by themselves. Everything except the forward runs on the event loop, so
+there are no locks.
 """
 
 import asyncio
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass, field
 from typing import TypeVar
 
@@ -31,13 +31,49 @@ _T = TypeVar("_T")
 _MIN_RETRY = 0.05
 _MAX_RETRY = 10.0
 _FIRST_RATE = 500.0
-"""agents/s, a guess until the first batch was measured."""
+"""agents/s; a guess until the first batch has been measured."""
 _SMOOTHING = 0.2
+
+
+class Call:
+    """A call that was admitted: its deadline, and the queue places that it holds until its batches start."""
+
+    def __init__(self, deadline: float) -> None:
+        """
+        Args:
+            deadline: the time on the event loop's clock, s.
+        """
+        self.deadline = deadline
+        """Deadline on the event loop's clock, s: the client's or the server's own, whichever is earlier."""
+        self.started = time.perf_counter()
+        """Start of the work for the call, by ``time.perf_counter``."""
+        self.places = 0
+        """Number of queue places held."""
+
+    def remaining(self) -> float:
+        """Return the seconds until the deadline; negative after it."""
+        return self.deadline - asyncio.get_running_loop().time()
+
+    @asynccontextmanager
+    async def in_time(self) -> AsyncIterator[None]:
+        """Cancel the block at the deadline.
+
+        Raises:
+            DeadlineExceeded: the deadline passed.
+        """
+        timeout = asyncio.timeout_at(self.deadline)
+        try:
+            async with timeout:
+                yield
+        except TimeoutError:
+            if not timeout.expired():
+                raise
+            raise DeadlineExceeded("the deadline passed before a forecast was made") from None
 
 
 @dataclass(frozen=True)
 class Job:
-    """Agents of one call that one forward can take."""
+    """Agents of one call that can share a forward."""
 
     forecaster: Forecaster
     agent_type: AgentType
@@ -47,48 +83,32 @@ class Job:
 
     @property
     def agents(self) -> int:
-        """How many."""
+        """Number of agents."""
         return agent_count(self.features)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a job."""
+    """Result of a job."""
 
     mixture: TrajectoryMixture
-    """Of the job's agents, in order."""
+    """Forecasts of the job's agents, in order."""
     queue: float
-    """s from the call's acceptance until its (first) batch started."""
+    """Seconds from the start of the call until its (first) batch started."""
     inference: float
-    """s in the model, of all its batches."""
+    """Seconds in the model, summed over its batches."""
     batch_agents: int
-    """Agents in its (largest) batch."""
-
-
-class Admission:
-    """A call's place in the queue, held until its batches start."""
-
-    def __init__(self, agents: int, accepted: float | None = None) -> None:
-        """
-        Args:
-            agents: that hold a place.
-            accepted: when the call was accepted, by ``time.perf_counter``; None: now.
-        """
-        self.agents = agents
-        """Agents that still hold a place."""
-        self.accepted = time.perf_counter() if accepted is None else accepted
-        """When the call was accepted, by ``time.perf_counter``."""
+    """Number of agents in its (largest) batch."""
 
 
 @dataclass(eq=False)
 class _Entry:
-    """A job, or a part of one, that is small enough for a batch."""
+    """A job, or a part of one, that fits a batch."""
 
     job: Job
     features: Features
     agents: int
-    deadline: float
-    admission: Admission
+    call: Call
     queued: float
     """By ``time.perf_counter``."""
     done: "asyncio.Future[Outcome]" = field(
@@ -97,27 +117,29 @@ class _Entry:
 
     @property
     def key(self) -> tuple[int, AgentType, Context]:
-        """Entries of equal keys can share a forward."""
+        """Key of the entries that can share a forward."""
         return id(self.job.forecaster), self.job.agent_type, self.job.context
 
 
 class Batcher:
-    """The queue and the thread of the model."""
+    """Queue of jobs and thread of the forward."""
 
     def __init__(
         self, max_batch_agents: int, max_queue_agents: int, metrics: Metrics, threads: int | None = None
     ) -> None:
         """
         Args:
-            max_batch_agents: agents in one forward.
-            max_queue_agents: agents accepted but not in the model yet.
-            metrics: where batches are counted.
-            threads: threads of the forward; None: torch's choice, the physical cores.
+            max_batch_agents: max number of agents in one forward.
+            max_queue_agents: max number of agents admitted but not in the model yet.
+            metrics: the metrics that count batches.
+            threads: number of threads of the forward; None: torch's choice, the physical cores.
         """
         self._max_batch = max_batch_agents
         self._max_queue = max_queue_agents
         self._metrics = metrics
         self._queue: deque[_Entry] = deque()
+        self._running: list[_Entry] = []
+        self._running_since = 0.0
         self._waiting = 0
         self._rate = _FIRST_RATE
         self._wake = asyncio.Event()
@@ -125,76 +147,92 @@ class Batcher:
             1, thread_name_prefix="forward", initializer=set_forward_threads, initargs=(threads,)
         )
         self._worker: asyncio.Task[None] | None = None
+        self._crashed = False
+        self._on_crash: Callable[[], None] | None = None
 
     @property
     def waiting(self) -> int:
-        """Agents accepted but not in the model yet."""
+        """Number of agents admitted but not in the model yet."""
         return self._waiting
 
-    def start(self) -> None:
-        """Begins to take work; on the event loop that it will live on."""
+    @property
+    def forward_seconds(self) -> float:
+        """Seconds since the current batch started; 0 while the model is free."""
+        return time.perf_counter() - self._running_since if self._running else 0.0
+
+    def start(self, on_crash: Callable[[], None] | None = None) -> None:
+        """Start the worker on the running event loop.
+
+        Args:
+            on_crash: called if the worker ends by an exception, after its calls have failed.
+        """
+        self._on_crash = on_crash
         self._worker = asyncio.create_task(self._work(), name="batcher")
+        self._worker.add_done_callback(self._check_worker)
 
     async def stop(self) -> None:
-        """Refuses what is still queued and waits for the batch in the model."""
+        """Fail the queued jobs, and wait for the batch that is in the model."""
         if self._worker is not None:
             self._worker.cancel()
             await asyncio.gather(self._worker, return_exceptions=True)
-        while self._queue:
-            entry = self._queue.popleft()
-            if not entry.done.done():
-                entry.done.set_exception(Unavailable("the server is stopping"))
+        self._fail(self._queue, Unavailable("the server is stopping"))
+        self._queue.clear()
         await asyncio.to_thread(self._thread.shutdown)
 
-    def check(self) -> None:
-        """Whether there is room for even the smallest call.
-
-        Raises:
-            Overloaded: there is none.
-        """
-        self._require_room(1)
-
-    @contextmanager
-    def admit(self, agents: int, accepted: float | None = None) -> Iterator[Admission]:
-        """A place in the queue for a call, before any work is put into it.
+    def admit(self, deadline: float) -> Call:
+        """Admit a call on its arrival, before any work is spent on it.
 
         Args:
-            agents: that the call wants forecast; a call of none counts as one.
-            accepted: when the call was accepted, by ``time.perf_counter``; None: now.
+            deadline: the time on the event loop's clock; work that has not started by then never does.
 
         Raises:
-            Overloaded: there is no room.
+            Overloaded: the queue has no room for even the smallest call.
+        """
+        self._require_room(1)
+        return Call(deadline)
+
+    @contextmanager
+    def hold_places(self, call: Call, agents: int) -> Iterator[None]:
+        """Hold queue places for the agents of a call; those that are left at the end are given back.
+
+        Args:
+            call: the call.
+            agents: number of agents to forecast; a call without any takes one place.
+
+        Raises:
+            Overloaded: the queue has no room for so many.
         """
         agents = max(agents, 1)
         self._require_room(agents)
-        admission = Admission(agents, accepted)
+        call.places += agents
         self._count(agents)
         try:
-            yield admission
+            yield
         finally:
-            self._release(admission, admission.agents)
+            self._release(call, call.places)
 
-    async def run(self, jobs: Sequence[Job], deadline: float, admission: Admission) -> list[Outcome]:
-        """Runs the jobs of one call.
+    async def run(self, jobs: Sequence[Job], call: Call) -> list[Outcome]:
+        """Run the jobs of a call, of any forecasters and types.
 
         Args:
-            jobs: of any forecasters and types.
-            deadline: on the event loop's clock; work that has not started by then never does.
-            admission: the call's; its places pass to the jobs.
+            jobs: the jobs.
+            call: the call, whose places pass to the jobs.
 
         Returns:
-            What became of each job, in order.
+            The result of each job, in order.
 
         Raises:
-            DeadlineExceeded: it passed before the model was free.
+            DeadlineExceeded: the deadline passed before the model was free.
             Internal: the forward failed.
             Unavailable: the server stopped first.
         """
-        parts = [self._entries(job, deadline, admission) for job in jobs]
+        if self._crashed:
+            raise Internal()
+        parts = [self._entries(job, call) for job in jobs]
         entries = [entry for part in parts for entry in part]
-        surplus = admission.agents - sum(entry.agents for entry in entries)
+        surplus = call.places - sum(entry.agents for entry in entries)
         if surplus > 0:  # agents that need no forward give their places back at once
-            self._release(admission, surplus)
+            self._release(call, surplus)
         self._queue.extend(entries)
         self._wake.set()
         try:
@@ -206,63 +244,77 @@ class Batcher:
         return [_combine([entry.done.result() for entry in part]) for part in parts]
 
     async def run_in_model_thread(self, job: Job) -> None:
-        """Runs a job past the queue, for warm-up."""
+        """Run a job past the queue, for warm-up."""
         await self.call_in_model_thread(_forward, job, [job.features], job.steps)
 
     async def call_in_model_thread(self, function: Callable[..., _T], *arguments: object) -> _T:
-        """Calls a function in the forward's thread, past the queue."""
+        """Call a function in the thread of the forward, past the queue."""
         return await asyncio.get_running_loop().run_in_executor(self._thread, function, *arguments)
 
-    def _entries(self, job: Job, deadline: float, admission: Admission) -> list[_Entry]:
-        """The job in parts that fit a batch."""
+    def _entries(self, job: Job, call: Call) -> list[_Entry]:
+        """Return the job in parts that fit a batch."""
         queued = time.perf_counter()
         entries = []
         for start in range(0, job.agents, self._max_batch):
             stop = min(start + self._max_batch, job.agents)
             whole = stop - start == job.agents
             features = job.features if whole else {name: t[start:stop] for name, t in job.features.items()}
-            entries.append(_Entry(job, features, stop - start, deadline, admission, queued))
+            entries.append(_Entry(job, features, stop - start, call, queued))
         return entries
 
     def _withdraw(self, entries: Sequence[_Entry]) -> None:
-        """Takes a call's entries out of the queue, whatever state they are in."""
+        """Remove a call's entries from the queue, in whatever state they are."""
         for entry in entries:
             if entry in self._queue:
                 self._queue.remove(entry)
             if not entry.done.cancel() and not entry.done.cancelled():
-                entry.done.exception()  # looked at, or asyncio would complain that nobody did
+                entry.done.exception()  # retrieved, or asyncio would log that it never was
 
     async def _work(self) -> None:
-        loop = asyncio.get_running_loop()
         while True:
             await self._wake.wait()
-            batch = self._take_batch()
-            if not batch:
-                if not self._queue:
-                    self._wake.clear()
-                continue
-            started = time.perf_counter()
-            job = batch[0].job
-            steps = max(entry.job.steps for entry in batch)
-            parts = [entry.features for entry in batch]
-            running = loop.run_in_executor(self._thread, _forward, job, parts, steps)
-            try:
-                mixture, seconds = await asyncio.shield(running)
-            except asyncio.CancelledError:  # the batcher stops; the batch it has taken is finished first
-                await asyncio.wait([running])
-                self._fail(batch, Unavailable("the server is stopping"))
-                raise
-            except Exception:
-                _log.exception(
-                    "forward failed", model=job.forecaster.info.name, agents=sum(e.agents for e in batch)
-                )
-                self._fail(batch, Internal())
-                continue
-            self._measure(batch, started, seconds)
-            self._deliver(batch, mixture, started, seconds)
+            self._running = self._take_batch()
+            if self._running:
+                self._running_since = time.perf_counter()
+                await self._run_batch(self._running, self._running_since)
+                self._running = []
+            elif not self._queue:
+                self._wake.clear()
+
+    async def _run_batch(self, batch: Sequence[_Entry], started: float) -> None:
+        job = batch[0].job
+        steps = max(entry.job.steps for entry in batch)
+        parts = [entry.features for entry in batch]
+        running = asyncio.get_running_loop().run_in_executor(self._thread, _forward, job, parts, steps)
+        try:
+            mixture, seconds = await asyncio.shield(running)
+        except asyncio.CancelledError:  # the batcher stops; a batch that has started is finished first
+            await asyncio.wait([running])
+            self._fail(batch, Unavailable("the server is stopping"))
+            raise
+        except Exception:
+            _log.exception(
+                "forward failed", model=job.forecaster.info.name, agents=sum(e.agents for e in batch)
+            )
+            self._fail(batch, Internal())
+            return
+        self._measure(batch, started, seconds)
+        self._deliver(batch, mixture, started, seconds)
+
+    def _check_worker(self, worker: "asyncio.Task[None]") -> None:
+        """Fail all calls if the worker has crashed: without it nothing would ever be answered."""
+        if worker.cancelled():
+            return
+        _log.critical("batcher crashed", exc_info=worker.exception())
+        self._crashed = True
+        self._fail([*self._running, *self._queue], Internal())
+        self._running = []
+        self._queue.clear()
+        if self._on_crash is not None:
+            self._on_crash()
 
     def _take_batch(self) -> list[_Entry]:
-        """The oldest entry and all that can ride with it, in order; expired ones are dropped."""
+        """Take the oldest entry and all that can share its batch, in order; drop expired entries."""
         now = asyncio.get_running_loop().time()
         batch: list[_Entry] = []
         rest: deque[_Entry] = deque()
@@ -270,19 +322,19 @@ class Batcher:
         for entry in self._queue:
             if entry.done.done():
                 continue
-            if entry.deadline <= now:
+            if entry.call.deadline <= now:
                 entry.done.set_exception(DeadlineExceeded("the deadline passed while the call was queued"))
             elif (batch and entry.key != batch[0].key) or full:
                 rest.append(entry)
             elif agents + entry.agents > self._max_batch:
-                full = True  # nothing younger overtakes it
+                full = True  # younger entries must not overtake this one
                 rest.append(entry)
             else:
                 batch.append(entry)
                 agents += entry.agents
         self._queue = rest
         for entry in batch:
-            self._release(entry.admission, entry.agents)
+            self._release(entry.call, entry.agents)
         return batch
 
     def _deliver(
@@ -294,12 +346,12 @@ class Batcher:
             part = mixture[position : position + entry.agents]
             position += entry.agents
             if not entry.done.done():
-                queue = started - entry.admission.accepted
+                queue = started - entry.call.started
                 outcome = Outcome(_cut(part, entry.job.steps), queue, seconds, agents)
                 entry.done.set_result(outcome)
 
-    def _fail(self, batch: Sequence[_Entry], error: Internal | Unavailable) -> None:
-        for entry in batch:
+    def _fail(self, entries: Iterable[_Entry], error: Internal | Unavailable) -> None:
+        for entry in entries:
             if not entry.done.done():
                 entry.done.set_exception(type(error)(error.detail))
 
@@ -320,29 +372,43 @@ class Batcher:
             )
 
     def _retry_after(self) -> float:
-        """s until what is queued now should be through."""
+        """Return the seconds until the agents that are queued now should have been forecast."""
         return min(max(self._waiting / self._rate, _MIN_RETRY), _MAX_RETRY)
 
     def _count(self, agents: int) -> None:
         self._waiting += agents
         self._metrics.queue_agents.set(self._waiting)
 
-    def _release(self, admission: Admission, agents: int) -> None:
-        """Gives places back; work beyond what was admitted (a second forward) holds none."""
-        agents = min(agents, admission.agents)
-        admission.agents -= agents
+    def _release(self, call: Call, agents: int) -> None:
+        """Give places of a call back; a second forward of an agent holds none."""
+        agents = min(agents, call.places)
+        call.places -= agents
         self._count(-agents)
 
 
 def _forward(job: Job, parts: Sequence[Features], steps: int) -> tuple[TrajectoryMixture, float]:
-    """One forward of the job's forecaster over the joined parts, and the seconds it took."""
+    """Run one forward of the job's forecaster over the joined parts.
+
+    Returns:
+        The mixture, and the seconds that it took.
+
+    Raises:
+        RuntimeError: the mixture is not one of the expected agents, modes and steps.
+    """
     started = time.perf_counter()
     with torch.inference_mode():
         features = join(parts)
         mixture = job.forecaster.forecast(features, job.agent_type, job.context, steps)
-    expected = agent_count(features)
-    if len(mixture) != expected:
-        raise RuntimeError(f"{job.forecaster.info.name} made {len(mixture)} forecasts of {expected} agents")
+    info = job.forecaster.info
+    agents, modes = agent_count(features), info.modes
+    expected = ((agents, modes), (agents, modes, steps, 2), (agents, modes, steps, 2, 2), (agents, 2))
+    tensors = (mixture.log_weights, mixture.means, mixture.covariances, mixture.origin)
+    shapes = tuple(tuple(tensor.shape) for tensor in tensors)
+    if shapes != expected:
+        raise RuntimeError(
+            f"{info.name} must forecast {agents} agents with {modes} modes of {steps} steps, but its "
+            f"log-weights, means, covariances and origins are of the shapes {shapes}"
+        )
     return mixture, time.perf_counter() - started
 
 
@@ -355,7 +421,7 @@ def _cut(mixture: TrajectoryMixture, steps: int) -> TrajectoryMixture:
 
 
 def _combine(outcomes: Sequence[Outcome]) -> Outcome:
-    """The parts of a split job as one."""
+    """Return the outcome of a job from those of its parts."""
     if len(outcomes) == 1:
         return outcomes[0]
     mixtures = [outcome.mixture for outcome in outcomes]

@@ -1,4 +1,4 @@
-"""The loaded models as the service uses them: the default, the fallback, all by name."""
+"""Loaded models by name, with the default and the fallback."""
 
 from dataclasses import dataclass
 from typing import Protocol as Interface
@@ -28,28 +28,32 @@ TYPE_NUMBERS = {
 
 
 class Models(Interface):
-    """What the service needs of a registry (``model.registry.Registry``)."""
+    """Interface of a registry, such as ``model.registry.Registry``."""
 
     def get(self, name: str) -> Forecaster:
-        """By "name" or "name@version"; raises ``UnknownModelError``."""
+        """Return a model by "name" or "name@version".
+
+        Raises:
+            UnknownModelError: the model is not loaded.
+        """
 
     def infos(self) -> list[ModelInfo]:
-        """All, sorted by name, then version."""
+        """Return all models, sorted by name, then version."""
 
 
 @dataclass(frozen=True)
 class Catalog:
-    """Models, the default among them, and the one that everything falls back to."""
+    """Loaded models, the default and the fallback among them."""
 
     models: Models
     default: Forecaster
     fallback: Forecaster
 
     def get(self, name: str) -> Forecaster:
-        """A model by "name" or "name@version"; the default for the empty name.
+        """Return a model by "name" or "name@version"; the default for the empty name.
 
         Raises:
-            UnknownModel: it is not loaded.
+            UnknownModel: the model is not loaded.
         """
         if not name:
             return self.default
@@ -61,7 +65,7 @@ class Catalog:
             raise UnknownModel(str(error)) from error
 
     def describe(self, info: ModelInfo) -> pb.Model:
-        """The contract's message on a model."""
+        """Return the contract's description of a model."""
         return pb.Model(
             name=info.name,
             version=info.version,
@@ -84,23 +88,23 @@ class Catalog:
 
 
 def reference(info: ModelInfo) -> pb.ModelReference:
-    """Which model made a forecast."""
+    """Return the contract's reference to a model."""
     return pb.ModelReference(name=info.name, version=info.version, protocol=PROTOCOLS[info.protocol])
 
 
 def build_catalog(models: Models, default: str | None) -> Catalog:
-    """Chooses default and fallback, and says which and why.
+    """Choose default and fallback, and log the default.
 
     Args:
-        models: what was loaded.
-        default: the one that was asked for; None: "cab" if loaded, else "kalman".
+        models: the loaded models.
+        default: the name of the default; None: "cab" if loaded, else "kalman".
 
     Raises:
-        SettingsError: a model that is needed is not there, or the fallback forecasts less far than another.
+        SettingsError: a required model is not loaded, or a model has a longer horizon than the fallback.
     """
     names = {info.name for info in models.infos()}
     if default is not None:
-        name, why = default, "it was asked for"
+        name, why = default, "it is configured"
     elif _PREFERRED in names:
         name, why = _PREFERRED, "it is loaded"
     else:

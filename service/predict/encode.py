@@ -1,105 +1,43 @@
-"""Mixtures into the contract's messages."""
+"""Encoding of a plan's forecasts as the contract's response."""
 
 import hashlib
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
-from model.arrays import Bools, Floats, Ints
+from model.arrays import Floats, Ints
+from model.metrics.offroad import off_road
 from model.mixture import TrajectoryMixture, merge_modes
-from model.scenes.scene import STEP_SECONDS
-from service.predict.batcher import Outcome
+from model.scenes.scene import STEP_SECONDS, Raster
 from service.predict.catalog import reference
-from service.predict.plan import Draft, Plan
+from service.predict.plan import Group, Plan
 from service.predict.request import Options
 
 
-@dataclass(frozen=True)
-class Result:
-    """Forecasts that were made, and for whom."""
-
-    drafts: Sequence[Draft]
-    mixture: TrajectoryMixture
-    """Of those drafts, in order; every number finite."""
-
-
-@dataclass(frozen=True)
-class _Numbers:
-    """A result's numbers as the answer wants them, float64; at most M of the K modes."""
-
-    counts: Ints
-    """[N], how many of the M are the agent's; what stands behind them is to be left out."""
-    mode_ids: Ints
-    """[N, M], ascending."""
-    weights: Floats
-    """[N, M]."""
-    remaining: Floats
-    """[N]."""
-    means: Floats
-    """[N, M, T · 2]."""
-    covariances: Floats
-    """[N, M, T · 3]."""
-    samples: Floats
-    """[N, S · T · 2]."""
-
-
-def finite(mixture: TrajectoryMixture) -> Bools:
-    """[N], whether an agent's forecast can be sent."""
-    weights = mixture.log_weights.double().exp()
-    parts = [
-        torch.isfinite(weights).all(dim=1) & (weights.sum(dim=1) > 0),
-        torch.isfinite(mixture.means).flatten(1).all(dim=1),
-        torch.isfinite(mixture.covariances).flatten(1).all(dim=1),
-        torch.isfinite(mixture.origin).all(dim=1),
-    ]
-    mask: Bools = torch.stack(parts).all(dim=0).numpy()
-    return mask
-
-
-def agent_seed(seed: int, agent_id: str) -> int:
-    """Seed of one agent's samples: the same whoever else is in the call or the batch.
+def encode(plan: Plan, seed: int) -> pb.PredictResponse:
+    """Return the response to a call.
 
     Args:
-        seed: the call's, 32 bits.
-        agent_id: the agent's.
+        plan: the plan of the call, whose groups have run.
+        seed: the seed of the samples; 0 if none are drawn.
     """
-    digest = hashlib.blake2b(agent_id.encode(), digest_size=8, key=seed.to_bytes(4, "little")).digest()
-    return int.from_bytes(digest, "little") >> 1  # torch takes 63 bits without a sign
-
-
-def encode(
-    plan: Plan, results: Sequence[Result], outcomes: Sequence[Outcome], seed: int
-) -> pb.PredictResponse:
-    """The answer to a call.
-
-    Args:
-        plan: what was to be answered.
-        results: the forecasts that were made.
-        outcomes: of all batches that the call rode in.
-        seed: of the samples; 0 when none are drawn.
-    """
-    options = plan.options
     response = pb.PredictResponse(
         model=reference(plan.forecaster.info),
-        time=options.time,
-        steps=options.steps,
+        time=plan.options.time,
+        steps=plan.options.steps,
         step=STEP_SECONDS,
         seed=seed,
         warnings=plan.warnings,
     )
+    outcomes = [group.outcome for group in plan.groups if group.outcome is not None]
     response.timing.queue = min((outcome.queue for outcome in outcomes), default=0.0)
     response.timing.inference = sum(outcome.inference for outcome in outcomes)
     response.timing.batch_agents = max((outcome.batch_agents for outcome in outcomes), default=0)
 
-    places: dict[int, tuple[_Numbers, int]] = {}
-    for result in results:
-        seeds = [agent_seed(seed, draft.agent_id) for draft in result.drafts]
-        numbers = _numbers(result.mixture, options, seeds)
-        for row, draft in enumerate(result.drafts):
-            places[draft.index] = numbers, row
+    forecasts: dict[int, pb.AgentForecast] = {}
     for draft in plan.drafts:
         forecast = response.forecasts.add(agent_id=draft.agent_id, status=draft.status, detail=draft.detail)
         if draft.status == pb.FORECAST_STATUS_INVALID:
@@ -107,18 +45,60 @@ def encode(
         if draft.forecaster is not None:
             forecast.model.CopyFrom(reference(draft.forecaster.info))
             forecast.history_frames = draft.history_frames
-            _fill(forecast, *places[draft.index])
+            forecasts[draft.index] = forecast
+    for group in plan.groups:
+        if group.outcome is not None and group.drafts:
+            members = [forecasts[draft.index] for draft in group.drafts]
+            _fill(members, group.outcome.mixture, plan.options, seed)
     return response
 
 
-def _numbers(mixture: TrajectoryMixture, options: Options, seeds: Sequence[int]) -> _Numbers:
+def agent_seed(seed: int, agent_id: str) -> int:
+    """Return the seed of one agent's samples, which does not depend on the other agents of call or batch.
+
+    Args:
+        seed: the seed of the call, 32 bits.
+        agent_id: the id of the agent.
+    """
+    digest = hashlib.blake2b(agent_id.encode(), digest_size=8, key=seed.to_bytes(4, "little")).digest()
+    return int.from_bytes(digest, "little") >> 1  # torch takes 63 bits without a sign
+
+
+def count_off_road(raster: Raster | None, groups: Sequence[Group]) -> Counter[str]:
+    """Count, by model, the most likely trajectories that leave the driveable area: known without any truth.
+
+    Args:
+        raster: the map of the scene; None: the road is unknown.
+        groups: the forecasts.
+    """
+    counts: Counter[str] = Counter()
+    if raster is None:
+        return counts
+    for group in groups:
+        if group.outcome is None or not group.drafts:
+            continue
+        mixture = group.outcome.mixture
+        # In numpy: torch would start helper threads here, which compete with the model
+        rows = np.arange(len(mixture))
+        paths = mixture.means.numpy()[rows, mixture.log_weights.numpy().argmax(axis=1)]
+        leaving = off_road(raster, paths + mixture.origin.numpy()[:, None]) > 0
+        if leaving.any():
+            counts[group.job.forecaster.info.name] += int(leaving.sum())
+    return counts
+
+
+def _fill(
+    forecasts: Sequence[pb.AgentForecast], mixture: TrajectoryMixture, options: Options, seed: int
+) -> None:
+    """Fill in the numbers of N agents' forecasts; at most M of the K modes each."""
     agents, modes = mixture.log_weights.shape
     counts: Ints = np.full(agents, modes)
     mode_ids: Ints = np.broadcast_to(np.arange(modes), (agents, modes))
     with torch.inference_mode():
-        drawn: Floats = (
-            mixture.sample(options.samples, seeds).numpy() if options.samples else np.zeros((agents, 0))
-        )
+        samples: Floats = np.zeros((agents, 0))
+        if options.samples:
+            seeds = [agent_seed(seed, forecast.agent_id) for forecast in forecasts]
+            samples = mixture.sample(options.samples, seeds).numpy().reshape(agents, -1)
         if options.merge:
             merged = merge_modes(mixture)
             mixture, counts, mode_ids = merged.mixture, merged.counts.numpy(), merged.mode_ids.numpy()
@@ -139,25 +119,14 @@ def _numbers(mixture: TrajectoryMixture, options: Options, seeds: Sequence[int])
             mode_ids[rows, places],
         )
         remaining = np.clip(1.0 - weights.sum(axis=1), 0.0, 1.0)
-    triangle = covariances[..., [0, 0, 1], [0, 1, 1]]
-    return _Numbers(
-        counts=counts,
-        mode_ids=mode_ids,
-        weights=weights,
-        remaining=remaining,
-        means=means.reshape(*mode_ids.shape, -1),
-        covariances=triangle.reshape(*mode_ids.shape, -1),
-        samples=drawn.reshape(agents, -1),
-    )
-
-
-def _fill(forecast: pb.AgentForecast, numbers: _Numbers, row: int) -> None:
-    # Lists, because protobuf takes a list of floats several times faster than an array
-    count = int(numbers.counts[row])
-    forecast.mode_ids.extend(numbers.mode_ids[row, :count].tolist())
-    forecast.weights.extend(numbers.weights[row, :count].tolist())
-    forecast.remaining_weight = float(numbers.remaining[row])
-    forecast.most_likely_mode = int(numbers.weights[row, :count].argmax())
-    forecast.means.extend(numbers.means[row, :count].ravel().tolist())
-    forecast.covariances.extend(numbers.covariances[row, :count].ravel().tolist())
-    forecast.samples.extend(numbers.samples[row].tolist())
+    triangles = covariances[..., [0, 0, 1], [0, 1, 1]]
+    for row, forecast in enumerate(forecasts):
+        # Lists, because protobuf takes a list of floats several times faster than an array
+        count = int(counts[row])  # merged agents have padding behind
+        forecast.mode_ids.extend(mode_ids[row, :count].tolist())
+        forecast.weights.extend(weights[row, :count].tolist())
+        forecast.remaining_weight = float(remaining[row])
+        forecast.most_likely_mode = int(weights[row, :count].argmax())
+        forecast.means.extend(means[row, :count].ravel().tolist())
+        forecast.covariances.extend(triangles[row, :count].ravel().tolist())
+        forecast.samples.extend(samples[row].tolist())

@@ -1,18 +1,19 @@
-"""Who forecasts which agent of a call, and from what."""
+"""Plan of a call: the forecaster of each agent, the forwards that follow, and what came of them."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
-from model.arrays import Ints
+from model.arrays import Bools, Ints
 from model.forecaster import Context, Forecaster, Protocol
+from model.mixture import TrajectoryMixture
 from model.scenes.resample import MAX_AGE, MAX_GAP, MIN_DIFFERENCE_SPAN, resample
 from model.scenes.scene import AgentType, Raster, Scene
 from service.errors import BadFields, Fault
-from service.predict.batcher import Job
+from service.predict.batcher import Job, Outcome
 from service.predict.catalog import Catalog
 from service.predict.request import Agents, Options, read_agents, read_raster
 from service.settings import FALLBACK_MODEL, Settings
@@ -20,55 +21,80 @@ from service.settings import FALLBACK_MODEL, Settings
 
 @dataclass
 class Draft:
-    """One agent's place in the answer, filled in as it becomes known."""
+    """One agent's forecast in the response, filled in as it becomes known."""
 
     index: int
-    """In the request."""
+    """Index of the agent in the request."""
     agent_id: str
     status: pb.ForecastStatus.ValueType
     detail: str = ""
     field: str = ""
-    """With INVALID and FALLBACK: what is to blame."""
+    """Path of the field at fault, with INVALID and FALLBACK."""
     row: int = -1
-    """In the scene; -1 with INVALID."""
+    """Row of the agent in the scene; -1 with INVALID."""
     forecaster: Forecaster | None = None
     """None with INVALID."""
     history_frames: int = 0
 
     def invalidate(self, fault: Fault) -> None:
-        """No forecast after all."""
+        """Set the status INVALID: there is no forecast."""
         self.status = pb.FORECAST_STATUS_INVALID
         self.field, self.detail = fault.field, fault.detail
         self.row, self.forecaster, self.history_frames = -1, None, 0
 
+    def fall_back(self, fallback: Forecaster, field_path: str, reason: str) -> None:
+        """Assign the agent to the fallback model."""
+        self.status = pb.FORECAST_STATUS_FALLBACK
+        self.field, self.detail = field_path, f"forecast by {FALLBACK_MODEL}: {reason}"
+        self.forecaster = fallback
+        self.history_frames = min(self.history_frames, fallback.info.history_frames)
 
-@dataclass(frozen=True)
+
+@dataclass
 class Group:
-    """Agents of one call that one forward can take."""
+    """Agents of one call that share a forward, and its outcome."""
 
     job: Job
     drafts: list[Draft]
-    """In the order of the job's agents."""
+    """In the order of the job's agents; once it has run, only those with finite forecasts."""
+    outcome: Outcome | None = None
+    """None until the job has run; its mixture is that of ``drafts``."""
+
+    def set_outcome(self, outcome: Outcome) -> list[Draft]:
+        """Store the outcome of the job.
+
+        Returns:
+            The drafts whose forecasts are not finite; they and their forecasts are dropped.
+        """
+        good = finite(outcome.mixture)
+        if good.all():
+            self.outcome = outcome
+            return []
+        broken = [draft for draft, fine in zip(self.drafts, good.tolist(), strict=True) if not fine]
+        rows = np.flatnonzero(good)
+        self.drafts = [self.drafts[row] for row in rows.tolist()]
+        self.outcome = replace(outcome, mixture=outcome.mixture[torch.from_numpy(rows)])
+        return broken
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A call, decoded: what is to be run, and what is to be answered."""
+    """A validated call: the forwards to run, and the forecasts of the response."""
 
     options: Options
     agents: Agents
     forecaster: Forecaster
-    """The one that was asked for."""
+    """The requested model."""
     fallback: Forecaster
     scene: Scene | None
-    """Agents that can be used; None when there are none."""
+    """Usable agents; None if there are none."""
     drafts: list[Draft]
-    """One for each agent of the answer, in its order."""
+    """One per forecast of the response, in its order."""
     warnings: list[str]
     groups: list[Group] = field(default_factory=list)
 
     def add_groups(self, drafts: Iterable[Draft]) -> list[Group]:
-        """Prepares the forwards of some drafts, one for each forecaster and agent type.
+        """Prepare the forwards of drafts, one per forecaster and agent type.
 
         Returns:
             The new groups, which are in ``groups`` as well.
@@ -81,6 +107,37 @@ class Plan:
         added = [self._group(self.scene, kind, group) for (_, kind), group in members.items()]
         self.groups.extend(added)
         return added
+
+    def replace_broken(self, broken: Sequence[Draft]) -> list[Group]:
+        """Assign agents without finite forecasts to the fallback; those that it forecast become INVALID.
+
+        Returns:
+            The new groups, which are in ``groups`` as well.
+        """
+        for draft in broken:
+            failed = draft.forecaster
+            if failed is None:
+                continue
+            reason = f"the forecast of {failed.info.name} was not finite"
+            path = f"agents[{draft.index}]"
+            if failed is self.fallback:
+                draft.invalidate(Fault(path, reason))
+            else:
+                draft.fall_back(self.fallback, path, reason)
+        return self.add_groups(draft for draft in broken if draft.forecaster is not None)
+
+    def check_strict(self) -> None:
+        """Fail a strict call in which an agent is not forecast as requested.
+
+        Raises:
+            BadFields: one fault per such agent.
+        """
+        if not self.options.strict:
+            return
+        refused = (pb.FORECAST_STATUS_INVALID, pb.FORECAST_STATUS_FALLBACK)
+        faults = [Fault(draft.field, draft.detail) for draft in self.drafts if draft.status in refused]
+        if faults:
+            raise BadFields(faults)
 
     def _group(self, scene: Scene, kind: AgentType, drafts: list[Draft]) -> Group:
         forecaster = drafts[0].forecaster
@@ -103,26 +160,24 @@ def make_plan(
     settings: Settings,
     agents: Agents | None = None,
 ) -> Plan:
-    """Decodes a request and prepares its forwards. Takes milliseconds: not for the event loop.
+    """Read map and agents of a request and prepare its forwards. Takes milliseconds: run it in a thread.
 
     Args:
-        request: of which the options were read already.
-        options: them.
-        forecaster: the one asked for.
-        catalog: where the fallback comes from.
+        request: the request.
+        options: its options.
+        forecaster: the requested model.
+        catalog: the models, among them the fallback.
         settings: the limits.
-        agents: of the request, if they were read already.
+        agents: the agents of the request, if they have been read before.
 
     Raises:
-        BadField: the map is wrong.
-        BadFields: the call is strict, and an agent cannot be forecast as asked.
+        BadField: the map is invalid.
+        BadFields: the call is strict, and an agent cannot be forecast as requested.
     """
     raster = read_raster(request, settings)
     if agents is None:
         agents = read_agents(request, settings)
-    frames = frames_of(forecaster, catalog)
-    scene, rows, faults = _build_scene(request, agents, frames, raster)
-    models = forecaster, catalog.fallback
+    scene, rows, faults = _build_scene(request, agents, frames_of(forecaster, catalog), raster)
     drafts = []
     for index, agent_id in enumerate(agents.ids):
         if index in faults:
@@ -130,57 +185,55 @@ def make_plan(
             draft.invalidate(faults[index])
             drafts.append(draft)
         elif agents.predict[index] and scene is not None:
-            drafts.append(_assign(index, agent_id, scene, rows[index], models))
+            drafts.append(_assign(index, agent_id, scene, rows[index], (forecaster, catalog.fallback)))
     plan = Plan(options, agents, forecaster, catalog.fallback, scene, drafts, [])
-    check_strict(plan)
+    plan.check_strict()
     plan.warnings.extend(_warnings(plan))
     plan.add_groups(draft for draft in drafts if draft.forecaster is not None)
     return plan
 
 
+def set_outcomes(groups: Sequence[Group], outcomes: Sequence[Outcome]) -> list[Draft]:
+    """Store the outcomes of the groups' jobs, and return the drafts whose forecasts are not finite."""
+    return [
+        draft for group, outcome in zip(groups, outcomes, strict=True) for draft in group.set_outcome(outcome)
+    ]
+
+
 def frames_of(forecaster: Forecaster, catalog: Catalog) -> int:
-    """Frames of history that a call may use."""
+    """Return the number of history frames that a call may use."""
     return max(forecaster.info.history_frames, catalog.fallback.info.history_frames)
 
 
-def check_strict(plan: Plan) -> None:
-    """Fails a strict call in which an agent is not forecast as asked.
-
-    Raises:
-        BadFields: one fault for each such agent.
-    """
-    if not plan.options.strict:
-        return
-    refused = (pb.FORECAST_STATUS_INVALID, pb.FORECAST_STATUS_FALLBACK)
-    faults = [Fault(draft.field, draft.detail) for draft in plan.drafts if draft.status in refused]
-    if faults:
-        raise BadFields(faults)
-
-
-def fall_back(draft: Draft, fallback: Forecaster, field_path: str, why: str) -> None:
-    """Gives an agent to the fallback model."""
-    draft.status = pb.FORECAST_STATUS_FALLBACK
-    draft.field, draft.detail = field_path, f"forecast by {FALLBACK_MODEL}: {why}"
-    draft.forecaster = fallback
-    draft.history_frames = min(draft.history_frames, fallback.info.history_frames)
+def finite(mixture: TrajectoryMixture) -> Bools:
+    """Return which agents' forecasts are finite, and so can be sent: [N]."""
+    weights = mixture.log_weights.double().exp()
+    parts = [
+        torch.isfinite(weights).all(dim=1) & (weights.sum(dim=1) > 0),
+        torch.isfinite(mixture.means).flatten(1).all(dim=1),
+        torch.isfinite(mixture.covariances).flatten(1).all(dim=1),
+        torch.isfinite(mixture.origin).all(dim=1),
+    ]
+    mask: Bools = torch.stack(parts).all(dim=0).numpy()
+    return mask
 
 
 def _build_scene(
     request: pb.PredictRequest, agents: Agents, frames: int, raster: Raster | None
 ) -> tuple[Scene | None, dict[int, int], dict[int, Fault]]:
-    """The usable agents as a scene, their rows in it by request index, and all faults."""
+    """Return the usable agents as a scene, their rows in it by request index, and all faults."""
     faults = dict(agents.faults)
     if agents.observations is None:
         return None, {}, faults
     states = resample(agents.observations, request.time, frames)
-    now = states.first < states.frames
-    kept = now & states.velocity_known
+    observed_now = states.first < states.frames
+    kept = observed_now & states.velocity_known
     for row in np.flatnonzero(~kept).tolist():
         index = int(agents.valid[row])
         detail = (
             "a single state needs its velocity, or another state "
             f"{MIN_DIFFERENCE_SPAN} s to {MAX_GAP} s before it"
-            if now[row]
+            if observed_now[row]
             else f"the newest state is more than {MAX_AGE} s old"
         )
         faults[index] = Fault(f"agents[{index}].states", detail)
@@ -200,7 +253,7 @@ def _build_scene(
 def _assign(
     index: int, agent_id: str, scene: Scene, row: int, models: tuple[Forecaster, Forecaster]
 ) -> Draft:
-    """Decides who forecasts an agent: the first model, or the second where the first cannot."""
+    """Assign an agent to the first model, or to the second if the first cannot forecast it."""
     forecaster, fallback = models
     observed = scene.states.frames - int(scene.states.first[row])
     draft = Draft(index, agent_id, pb.FORECAST_STATUS_OK, row=row, forecaster=forecaster)
@@ -213,7 +266,7 @@ def _assign(
             draft.invalidate(Fault(f"agents[{index}].{reason[0]}", reason[1]))
             return draft
         draft.history_frames = observed
-        fall_back(draft, fallback, f"agents[{index}].{reason[0]}", reason[1])
+        draft.fall_back(fallback, f"agents[{index}].{reason[0]}", reason[1])
     elif draft.history_frames < forecaster.info.history_frames:
         draft.status = pb.FORECAST_STATUS_SHORT_HISTORY
         draft.detail = f"{draft.history_frames} of {forecaster.info.history_frames} frames"
@@ -221,7 +274,7 @@ def _assign(
 
 
 def _unfit(forecaster: Forecaster, kind: AgentType, heading_known: bool) -> tuple[str, str] | None:
-    """Why a model cannot forecast an agent: the field to blame, and the reason; None when it can."""
+    """Return why a model cannot forecast an agent: the field at fault and the reason; None if it can."""
     if kind not in forecaster.info.agent_types:
         return "type", f"{forecaster.info.name} does not forecast agents of type {kind.value}"
     if not heading_known and forecaster.requires_heading(kind):
@@ -239,7 +292,7 @@ def _warnings(plan: Plan) -> list[str]:
         )
     scene = plan.scene
     if plan.options.context is Context.FULL and scene is not None and scene.raster is None:
-        # Of some types a model has learned nothing about the map: those agents lack none
+        # A model may read the map for some agent types only; the others do not miss it
         own = [
             draft
             for draft in plan.drafts

@@ -1,8 +1,8 @@
-"""How many threads each part of the service computes with.
+"""Number of torch threads in each kind of thread of the service.
 
-Every thread that runs a parallel section gets an OpenMP team of its own, and once the teams together are
-more than the cores, their members sleep between sections instead of waiting awake: a forward of hundreds
-of short sections then takes four times as long. So the forward's thread alone has a team.
+Every thread that runs a parallel section gets an OpenMP team of its own. Once the teams together exceed the
+cores, their members sleep between sections instead of spinning: a forward of hundreds of short sections then
+takes four times as long. Therefore only the thread of the forward has a team.
 """
 
 import torch
@@ -11,15 +11,15 @@ _CORES = torch.get_num_threads()
 """torch's choice when the process starts: the physical cores."""
 
 
-def set_forward_threads(wanted: int | None) -> None:
-    """For the forward's thread, to be called in it.
+def set_forward_threads(threads: int | None) -> None:
+    """Set the team size of the calling thread, which is that of the forward.
 
     Args:
-        wanted: threads of its team; None: torch's choice.
+        threads: the number of threads; None: torch's choice.
     """
-    torch.set_num_threads(wanted or _CORES)
+    torch.set_num_threads(threads or _CORES)
 
 
 def set_helper_threads() -> None:
-    """For every other thread that computes, to be called in it: it does so alone."""
+    """Make the calling thread compute without a team."""
     torch.set_num_threads(1)

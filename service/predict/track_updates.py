@@ -1,4 +1,4 @@
-"""What of a call goes into the track memory, and what comes out of it for a call."""
+"""Exchange of a call with the track memory: what is stored, and what the response tells of it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -7,7 +7,6 @@ from typing import TypeAlias
 from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.forecaster import Context, Forecaster
-from service.predict.encode import Result
 from service.predict.plan import Plan
 from service.predict.request import Agents
 from service.tracking.store.base import TrackUpdate
@@ -24,12 +23,12 @@ _SEVERITY = (
 )
 
 
-def observed(agents: Agents, models: tuple[Forecaster, Forecaster]) -> list[TrackUpdate]:
-    """All that a call says of its agents, before they are forecast.
+def observation_updates(agents: Agents, models: tuple[Forecaster, Forecaster]) -> list[TrackUpdate]:
+    """Return all observations of a call, for the recall before the forecast.
 
     Args:
-        agents: of the call.
-        models: the one that is asked for, and the fallback.
+        agents: the agents of the call.
+        models: the requested model and the fallback.
     """
     forecaster, fallback = models
     if agents.observations is None:
@@ -47,12 +46,13 @@ def observed(agents: Agents, models: tuple[Forecaster, Forecaster]) -> list[Trac
 
 
 def with_histories(agents: Agents, own: Sequence[TrackUpdate], histories: Mapping[str, bytes]) -> Agents:
-    """Agents with what the memory recalls of them.
+    """Return the agents with their histories from the track memory.
 
     Args:
-        agents: of the call.
-        own: what the call says of them, of ``observed``.
-        histories: by id, each with the call's own observations; empty where the memory did not answer.
+        agents: the agents of the call.
+        own: the call's own observations, from ``observation_updates``.
+        histories: the histories by id, the call's own observations included; empty if the memory did not
+            respond.
     """
     if not own or not histories:
         return agents
@@ -60,63 +60,61 @@ def with_histories(agents: Agents, own: Sequence[TrackUpdate], histories: Mappin
     return replace(agents, observations=unpack_observations(packed))
 
 
-def sightings(plan: Plan, results: Sequence[Result], remembered: bool) -> list[TrackUpdate]:
-    """What a call brings: forecasts but for blind ones, and each agent's newest observation, unless it is
-    remembered already.
+def forecast_updates(plan: Plan, remembered: bool) -> list[TrackUpdate]:
+    """Return what a call adds to the track memory: forecasts, except blind ones, and newest observations.
 
     Args:
-        plan: of the call.
-        results: the forecasts that were made.
-        remembered: whether the observations were, when histories were recalled.
+        plan: the plan of the call, whose groups have run.
+        remembered: flag for observations that were stored before, when histories were recalled.
     """
     agents = plan.agents
     made: dict[int, tuple[str, bytes]] = {}
     if plan.options.context is not Context.BLIND:
-        for result in results:
-            for draft, forecast in zip(result.drafts, pack_forecasts(result.mixture), strict=True):
-                if draft.forecaster is not None:
-                    made[draft.index] = draft.forecaster.info.full_name, forecast
+        for group in plan.groups:
+            if group.outcome is None or not group.drafts:
+                continue
+            name = group.job.forecaster.info.full_name
+            for draft, forecast in zip(group.drafts, pack_forecasts(group.outcome.mixture), strict=True):
+                made[draft.index] = name, forecast
     if agents.observations is None:
         return []
     packed = pack_observations(agents.observations, newest_only=True)
-    brought = []
+    added = []
     for index, kind, newest in zip(agents.valid.tolist(), agents.types, packed, strict=True):
         series, forecast = made.get(index, ("", b""))
         if remembered and not forecast:
             continue
         observations = b"" if remembered else newest
         steps = plan.options.steps if forecast else 0
-        brought.append(
-            TrackUpdate(agents.ids[index], AGENT_TYPES[kind], observations, series, forecast, steps)
-        )
-    return brought
+        added.append(TrackUpdate(agents.ids[index], AGENT_TYPES[kind], observations, series, forecast, steps))
+    return added
 
 
-def report(response: pb.PredictResponse, before: TrackingResult | None, after: TrackingResult) -> None:
-    """Puts what the memory said into the answer.
+def report(response: pb.PredictResponse, recalled: TrackingResult | None, stored: TrackingResult) -> None:
+    """Add what the track memory responded to the response of the call.
 
     Args:
-        response: the answer.
-        before: of the time before the forecasts, if histories were recalled.
-        after: of the time when they were brought.
+        response: the response of the call.
+        recalled: what it responded before the forecasts, if histories were recalled.
+        stored: what it responded when the forecasts were stored.
     """
-    first = before or after
-    response.tracking = max(first.status, after.status, key=_SEVERITY.index)
-    response.timing.tracking = after.seconds + (before.seconds if before is not None else 0.0)
+    first = recalled or stored
+    response.tracking = max(first.status, stored.status, key=_SEVERITY.index)
+    response.timing.tracking = stored.seconds + (recalled.seconds if recalled is not None else 0.0)
     for forecast in response.forecasts:
         agent_id = forecast.agent_id
         if response.tracking == consistency_pb.TRACKING_STATUS_UNAVAILABLE:
             forecast.tracking = response.tracking
         elif agent_id in first.agents:
-            forecast.tracking = _of_agent(first.agents[agent_id], after.agents.get(agent_id))
+            forecast.tracking = _status(first.agents[agent_id], stored.agents.get(agent_id))
         latest = first.latest.get(agent_id)
         if latest is not None and latest.model == forecast.model:
             forecast.consistency.CopyFrom(latest)
 
 
-def _of_agent(first: "Status", after: "Status | None") -> "Status":
-    """What became of an agent, which may have been lost between the two times that a call asked."""
-    gone = (consistency_pb.TRACKING_STATUS_NEW, consistency_pb.TRACKING_STATUS_RESET)
-    if first == consistency_pb.TRACKING_STATUS_OK and after in gone:
+def _status(first: "Status", second: "Status | None") -> "Status":
+    """Return the status of an agent, which may have been lost between the two exchanges of a call."""
+    lost = (consistency_pb.TRACKING_STATUS_NEW, consistency_pb.TRACKING_STATUS_RESET)
+    if first == consistency_pb.TRACKING_STATUS_OK and second in lost:
         return consistency_pb.TRACKING_STATUS_RESET
     return first

@@ -1,4 +1,4 @@
-"""First forwards, made before anyone waits for them: they allocate, compile and cache."""
+"""Warm-up: the first forwards of each model, which allocate, compile and cache, before any call waits."""
 
 import time
 
@@ -18,16 +18,15 @@ _SPEED = 5.0
 
 
 async def warm_up(batcher: Batcher, catalog: Catalog, max_batch_agents: int) -> None:
-    """Runs every model once for each agent type, alone; the default model and the fallback also in larger
-    batches, by powers of two up to the largest.
+    """Run every model once per agent type; the default and the fallback also in larger batches.
 
-    A server starts with many models and is mostly asked for one: the others' large batches would keep it
-    from being ready for seconds.
+    Batch sizes are the powers of two and the largest. Most calls use the default model, and large batches of
+    all models would delay readiness by seconds.
 
     Args:
-        batcher: whose model thread does the work.
+        batcher: the batcher, whose model thread runs the forwards.
         catalog: the models.
-        max_batch_agents: the largest batch there will be.
+        max_batch_agents: the max size of a batch.
     """
     started = time.perf_counter()
     forwards = 0
@@ -44,13 +43,13 @@ async def warm_up(batcher: Batcher, catalog: Catalog, max_batch_agents: int) -> 
 
 
 def _sizes(largest: int) -> list[int]:
-    """1, 2, 4, … and the largest."""
+    """Return 1, 2, 4, … and the largest."""
     sizes = [1 << power for power in range(largest.bit_length()) if 1 << power < largest]
     return [*sizes, largest]
 
 
 def _jobs(forecaster: Forecaster, kind: AgentType, context: Context, sizes: list[int]) -> list[Job]:
-    """One job of each size."""
+    """Return one job per size."""
     with torch.inference_mode():
         few = forecaster.prepare(_scene(forecaster, kind), np.arange(_SCENE_AGENTS), context)
         steps = forecaster.info.steps
@@ -58,13 +57,13 @@ def _jobs(forecaster: Forecaster, kind: AgentType, context: Context, sizes: list
 
 
 def _repeat(features: Features, size: int) -> Features:
-    """Features of so many agents, made of those of a few."""
+    """Return features of ``size`` agents, repeated from those of a few."""
     copies = -(-size // agent_count(features))
     return {name: tensor[:size] for name, tensor in join([features] * copies).items()}
 
 
 def _scene(forecaster: Forecaster, kind: AgentType) -> Scene:
-    """Agents abreast, driving straight on, on a map that is road throughout."""
+    """Return a scene of agents side by side that drive straight, on a map that is road everywhere."""
     frames = forecaster.info.history_frames
     age = STEP_SECONDS * np.arange(frames - 1, -1, -1.0)
     position = np.zeros((_SCENE_AGENTS, frames, 2))

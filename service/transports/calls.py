@@ -17,7 +17,7 @@ from cab.forecast.v1.routes import (
     Route,
 )
 from service.errors import BadField, Internal, ServiceError
-from service.predict.pipeline import DataPlane
+from service.predict.dataplane import DataPlane
 from service.telemetry.metrics import Call, Metrics
 
 _log = structlog.get_logger(__name__)

@@ -10,7 +10,7 @@ from cab_forecast import forecasts
 from model.checkpoint import load_checkpoint
 from model.forecaster import Forecaster, ModelInfo
 from model.registry import Registry, load_checkpoints
-from service.predict.pipeline import DataPlane
+from service.predict.dataplane import DataPlane
 from service.settings import bundled_models
 from service.telemetry.metrics import Metrics
 from tests.cases.case import CAR, Case

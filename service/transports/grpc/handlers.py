@@ -20,7 +20,7 @@ from grpc import aio
 from cab.forecast.v1.consistency_service_pb2 import WatchSceneRequest
 from cab.forecast.v1.routes import PREDICT, SERVICES, WATCH_SCENE, Request, Response, Route
 from service.errors import TooLarge
-from service.predict.pipeline import DataPlane
+from service.predict.dataplane import DataPlane
 from service.predict.request_reader import LARGE_BYTES, EncodedRequest, RequestLimits, read_protobuf
 from service.settings import Settings
 from service.telemetry.metrics import Metrics

@@ -10,7 +10,7 @@ from grpc_reflection.v1alpha import reflection
 
 from cab.forecast.v1.routes import SERVICES
 from service.errors import Unauthenticated
-from service.predict.pipeline import DataPlane
+from service.predict.dataplane import DataPlane
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
 from service.transports.auth import Tokens

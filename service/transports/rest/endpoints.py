@@ -14,7 +14,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from cab.forecast.v1.routes import MODEL_SERVICE, PREDICT, WATCH_SCENE, Route
 from service.errors import TooLarge
-from service.predict.pipeline import DataPlane
+from service.predict.dataplane import DataPlane
 from service.predict.request_reader import LARGE_BYTES, EncodedRequest, RequestLimits, read_protobuf
 from service.settings import Settings
 from service.telemetry.metrics import Metrics

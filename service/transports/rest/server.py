@@ -16,7 +16,7 @@ from starlette.responses import PlainTextResponse, Response
 
 from service.errors import BadField, MethodNotAllowed, NotFound, ServiceError, Unavailable
 from service.lifecycle import Phase
-from service.predict.pipeline import DataPlane
+from service.predict.dataplane import DataPlane
 from service.settings import Settings, split_address
 from service.telemetry.metrics import Metrics
 from service.transports.calls import to_service_error

@@ -9,7 +9,7 @@ import torch
 from model.forecaster import Context, Features
 from model.scenes.scene import AgentType
 from service.errors import DeadlineExceeded, Internal, Overloaded, Unavailable
-from service.predict.batcher import Admission, Batcher, Job, Outcome
+from service.predict.batcher import Batcher, Call, Job, Outcome
 from service.telemetry.metrics import Metrics
 from tests.service.fakes import FakeForecaster
 
@@ -53,8 +53,9 @@ def job(
 
 def submit(batcher: Batcher, *jobs: Job, deadline: float = FAR) -> "asyncio.Task[list[Outcome]]":
     async def call() -> list[Outcome]:
-        with batcher.admit(sum(each.agents for each in jobs)) as admission:
-            return await batcher.run(jobs, deadline, admission)
+        admitted = batcher.admit(deadline)
+        with batcher.hold_places(admitted, sum(each.agents for each in jobs)):
+            return await batcher.run(jobs, admitted)
 
     return asyncio.create_task(call())
 
@@ -165,15 +166,16 @@ async def test_a_full_queue_refuses(batcher: Batcher, fake: FakeForecaster) -> N
 
 
 async def test_places_are_given_back_without_a_forward(batcher: Batcher) -> None:
-    with batcher.admit(15) as admission:
+    call = batcher.admit(FAR)
+    with batcher.hold_places(call, 15):
         assert batcher.waiting == 15
-        assert await batcher.run([], FAR, admission) == []
+        assert await batcher.run([], call) == []
         assert batcher.waiting == 0
     assert batcher.waiting == 0
 
 
 async def test_empty_calls_count(batcher: Batcher) -> None:
-    with batcher.admit(0):
+    with batcher.hold_places(batcher.admit(FAR), 0):
         assert batcher.waiting == 1
 
 
@@ -260,7 +262,7 @@ async def test_stop_fails_what_waits_and_finishes_what_runs(fake: FakeForecaster
 
 async def test_a_second_forward_needs_no_place(batcher: Batcher, fake: FakeForecaster) -> None:
     fake.free.set()
-    assert await batcher.run([job(fake, 3)], FAR, Admission(0))
+    assert await batcher.run([job(fake, 3)], Call(FAR))
     assert batcher.waiting == 0
 
 

@@ -15,7 +15,7 @@ from model.forecaster import Context, Protocol
 from model.scenes.scene import AgentType
 from service.errors import BadField, BadFields, DeadlineExceeded, Overloaded, Unavailable, UnknownModel
 from service.lifecycle import Phase
-from service.predict.pipeline import DataPlane
+from service.predict.dataplane import DataPlane
 from service.predict.request_reader import EncodedRequest
 from service.settings import FALLBACK_MODEL, SettingsError
 from service.telemetry.metrics import Metrics

@@ -1,18 +1,19 @@
-"""Forecasts that leave the road."""
+"""Responses of a plan, and forecasts that leave the road."""
 
 import numpy as np
 import torch
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
+from model.forecaster import Context
 from model.mixture import TrajectoryMixture
-from model.scenes.scene import Raster
-from service.predict.encode import Result
-from service.predict.off_road import count_off_road
-from service.predict.plan import Draft
+from model.scenes.scene import AgentType, Raster
+from service.predict.batcher import Job, Outcome
+from service.predict.encode import count_off_road
+from service.predict.plan import Draft, Group
 from tests.service.fakes import FakeForecaster
 
 
-def result(ends: list[float], heaviest: int = 0) -> Result:
+def result(ends: list[float], heaviest: int = 0) -> Group:
     """Agents that go along x to their ends in the heaviest of three modes, and nowhere in the others."""
     means = torch.zeros(len(ends), 3, 12, 2)
     means[:, heaviest, :, 0] = torch.tensor(ends)[:, None] * torch.linspace(1 / 12, 1, 12)
@@ -21,9 +22,9 @@ def result(ends: list[float], heaviest: int = 0) -> Result:
     forecaster = FakeForecaster()
     drafts = [Draft(n, str(n), pb.FORECAST_STATUS_OK, row=n, forecaster=forecaster) for n in range(len(ends))]
     origin = torch.tensor([1000.0, 2000.0], dtype=torch.float64).expand(len(ends), 2)
-    return Result(
-        drafts, TrajectoryMixture(weights.log(), means, torch.eye(2).expand(len(ends), 3, 12, 2, 2), origin)
-    )
+    covariances = torch.eye(2).expand(len(ends), 3, 12, 2, 2)
+    outcome = Outcome(TrajectoryMixture(weights.log(), means, covariances, origin), 0.0, 0.0, len(ends))
+    return Group(Job(forecaster, AgentType.VEHICLE, Context.FULL, {}, 12), drafts, outcome)
 
 
 def raster() -> Raster:

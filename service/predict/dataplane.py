@@ -1,0 +1,159 @@
+"""Service without its transports: construction, start and end of everything that a call needs."""
+
+import asyncio
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import structlog
+
+from cab.forecast.v1 import model_service_pb2 as pb
+from service.errors import BadField, Unavailable
+from service.lifecycle import Lifecycle, Phase
+from service.predict.batcher import Batcher
+from service.predict.catalog import Models, build_catalog, reference
+from service.predict.pipeline import Pipeline
+from service.predict.torch_threads import set_helper_threads
+from service.predict.warmup import warm_up
+from service.settings import Settings
+from service.telemetry.metrics import Metrics
+from service.tracking.collector import ConsistencyCollector, StoreMetrics
+from service.tracking.model_references import ModelReferences
+from service.tracking.service import ConsistencyService
+from service.tracking.store.factory import make_store
+from service.tracking.store.guard import Guard
+from service.tracking.tracker import Tracker
+
+_log = structlog.get_logger(__name__)
+
+_MAX_WORKERS = 8
+
+
+class DataPlane:
+    """Everything that transports call. Used on one event loop."""
+
+    def __init__(self, settings: Settings, metrics: Metrics) -> None:
+        self._settings = settings
+        self._metrics = metrics
+        self._lifecycle = Lifecycle()
+        self._references = ModelReferences()
+        self._batcher = Batcher(
+            settings.max_batch_agents, settings.max_queue_agents, metrics, threads=settings.threads
+        )
+        self._threads = ThreadPoolExecutor(
+            min(_MAX_WORKERS, (os.cpu_count() or 1) + 1),
+            thread_name_prefix="calls",
+            initializer=set_helper_threads,
+        )
+        self._store = make_store(settings)
+        store_metrics = StoreMetrics(metrics.registry)
+        self._guard = Guard(store_metrics.observe, store_metrics.failed)
+        # A guard of their own, so that slow consistency calls do not open the circuit of the forecasts
+        self._asking = Guard(store_metrics.observe, store_metrics.failed)
+        tracker = Tracker(
+            self._store, self._guard, self._asking, settings.store_budget_ms / 1000, self._references
+        )
+        metrics.registry.register(ConsistencyCollector(tracker.aggregates))
+        self.consistency = ConsistencyService(
+            self._store, self._asking, tracker, self._references, self._lifecycle
+        )
+        """Calls of the consistency service."""
+        self._pipeline = Pipeline(settings, metrics, self._lifecycle, self._batcher, tracker, self._threads)
+        self.accept = self._pipeline.accept
+        """See ``Pipeline.accept``."""
+        self.predict = self._pipeline.predict
+        """See ``Pipeline.predict``."""
+
+    @property
+    def phase(self) -> Phase:
+        """Phase of the server."""
+        return self._lifecycle.phase
+
+    @property
+    def failed(self) -> asyncio.Event:
+        """Event that is set when the server can answer no call any more and must end."""
+        return self._lifecycle.failed
+
+    def require_ready(self) -> None:
+        """Refuse a readiness probe unless calls are accepted and forecast.
+
+        Raises:
+            Unavailable: the server is starting or draining, or a forward has not returned for longer than any
+                call may take.
+        """
+        self._lifecycle.require_ready()
+        seconds = self._batcher.forward_seconds
+        if seconds > self._settings.max_timeout:
+            raise Unavailable(f"a forward of the model has not returned for {seconds:.0f} s")
+
+    async def open(self, load: Callable[[], Models]) -> None:
+        """Load and warm up the models, then accept calls.
+
+        Args:
+            load: returns the models; called in a thread.
+
+        Raises:
+            SettingsError: a required model is missing.
+            Exception: any exception of ``load``.
+        """
+        models = await asyncio.get_running_loop().run_in_executor(self._threads, load)
+        catalog = build_catalog(models, self._settings.default_model)
+        self._batcher.start(self._lifecycle.fail)
+        await warm_up(self._batcher, catalog, self._settings.max_batch_agents)
+        self._metrics.set_models(models.infos(), catalog.default.info)
+        self._references.set_loaded(reference(info) for info in models.infos())
+        self._pipeline.catalog = catalog
+        self._lifecycle.set_ready()
+
+    def refuse(self) -> None:
+        """Accept no more calls; those in progress go on, except streams of consistency events."""
+        self._lifecycle.refuse()
+        self.consistency.end_watching()
+
+    async def drain(self, seconds: float) -> bool:
+        """Refuse new calls and wait until the responses of all accepted calls have been sent.
+
+        Args:
+            seconds: timeout.
+
+        Returns:
+            False if calls are still in progress after the timeout.
+        """
+        self.refuse()
+        idle = await self._lifecycle.wait_idle(seconds)
+        if not idle:
+            _log.warning("calls left unanswered", calls=self._lifecycle.calls)
+        return idle
+
+    async def close(self) -> None:
+        """Refuse new calls and release threads and connections."""
+        self.refuse()
+        await self._batcher.stop()
+        await self._guard.close()
+        await self._asking.close()
+        await self._store.close()
+        await asyncio.to_thread(self._threads.shutdown, cancel_futures=True)
+
+    async def list_models(self, request: pb.ListModelsRequest) -> pb.ListModelsResponse:
+        """Return all models.
+
+        Raises:
+            Unavailable: the server is not ready.
+        """
+        self._lifecycle.require_ready()
+        catalog = self._pipeline.catalog
+        return pb.ListModelsResponse(models=[catalog.describe(info) for info in catalog.models.infos()])
+
+    async def get_model(self, request: pb.GetModelRequest) -> pb.GetModelResponse:
+        """Return one model.
+
+        Raises:
+            BadField: the name is missing.
+            UnknownModel: the model is not loaded.
+            Unavailable: the server is not ready.
+        """
+        self._lifecycle.require_ready()
+        if not request.name:
+            raise BadField("name", "is required")
+        catalog = self._pipeline.catalog
+        return pb.GetModelResponse(model=catalog.describe(catalog.get(request.name).info))
