@@ -1,1 +1,1 @@
-"""Motion forecasting without a server: scenes, states, networks, mixtures, physics, checkpoints."""
+"""Motion forecasting without a server: scenes, features, baselines, networks, training, metrics."""

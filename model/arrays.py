@@ -1,4 +1,4 @@
-"""Names of the array types that the package passes around."""
+"""Aliases of the numpy array types in signatures."""
 
 from typing import TypeAlias
 

@@ -1,6 +1,6 @@
 """A trained model in a folder: ``config.json``, ``model.safetensors`` and ``README.md``, its model card.
 
-Nothing in a checkpoint is code, and loading one runs none (safetensors, not pickles).
+A checkpoint contains no code, and loading one executes none (safetensors, not pickles).
 """
 
 import hashlib
@@ -21,14 +21,14 @@ from model.networks.config import AnyNetworkConfig, CoverNetConfig
 from model.networks.forecaster import CoverNetForecaster, CvaeForecaster
 
 FORMAT_VERSION = 1
-"""Of the folder's layout and of config.json; what reads one version reads no other."""
+"""Version of the folder's layout and of config.json; a release reads exactly one version."""
 CONFIG_FILE = "config.json"
 TENSORS_FILE = "model.safetensors"
 CARD_FILE = "README.md"
 
 
 class CheckpointError(Exception):
-    """A checkpoint cannot be used: which file, and what is wrong with it."""
+    """An unusable checkpoint: the file, and its fault."""
 
     def __init__(self, file: Path, fault: str) -> None:
         super().__init__(f"{file}: {fault}")
@@ -43,7 +43,7 @@ def _format_version(value: int) -> int:
 
 
 class CheckpointConfig(BaseModel):
-    """What config.json holds."""
+    """The content of config.json."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -51,7 +51,7 @@ class CheckpointConfig(BaseModel):
     info: ModelInfo
     network: AnyNetworkConfig
     tensors_sha256: str
-    """Of model.safetensors, so that files of two checkpoints are never mixed."""
+    """Checksum of model.safetensors, so that files of two checkpoints are never mixed."""
 
     @model_validator(mode="after")
     def _version_is_ordered(self) -> "CheckpointConfig":
@@ -82,7 +82,7 @@ class CheckpointConfig(BaseModel):
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A checkpoint that was read; its tensors are finite, but not yet known to fit the network."""
+    """A loaded checkpoint. Its tensors are finite, but not yet checked against the network."""
 
     folder: Path
     info: ModelInfo
@@ -90,7 +90,7 @@ class Checkpoint:
     tensors: Mapping[str, Tensor]
 
     def forecaster(self) -> Forecaster:
-        """The model.
+        """Return the model.
 
         Raises:
             CheckpointError: tensors are missing, unexpected or of the wrong shape.
@@ -106,18 +106,18 @@ class Checkpoint:
 def save_checkpoint(
     folder: Path, info: ModelInfo, network_config: AnyNetworkConfig, tensors: Mapping[str, Tensor], card: str
 ) -> None:
-    """Writes a checkpoint; its three files are replaced where they exist.
+    """Write a checkpoint, replacing its three files if they exist.
 
     Args:
-        folder: made where it does not exist.
-        info: what is known of the model.
-        network_config: the network's shape.
-        tensors: the network's parameters by name.
-        card: the model card, Markdown.
+        folder: the folder, created if missing.
+        info: facts about the model.
+        network_config: configuration of the network.
+        tensors: parameters of the network by name.
+        card: model card, Markdown.
 
     Raises:
         CheckpointError: a tensor is not finite.
-        ValueError: info does not fit the network, or has no proper version.
+        ValueError: info does not fit the network, or its version is invalid.
     """
     _check_finite(folder / TENSORS_FILE, tensors)
     data = safetensors.torch.save({name: tensor.contiguous() for name, tensor in tensors.items()})
@@ -134,7 +134,7 @@ def save_checkpoint(
 
 
 def load_checkpoint(folder: Path) -> Checkpoint:
-    """Reads a checkpoint, on the CPU.
+    """Read a checkpoint, on the CPU.
 
     Raises:
         CheckpointError: a file is missing, damaged or of an unknown format.
@@ -144,7 +144,7 @@ def load_checkpoint(folder: Path) -> Checkpoint:
     data = _read(file)
     try:
         tensors = safetensors.torch.load(data)
-    except (SafetensorError, KeyError, ValueError, RuntimeError) as error:  # the rest: unusual types
+    except (SafetensorError, KeyError, ValueError, RuntimeError) as error:  # the last three: unknown types
         raise CheckpointError(file, f"not a whole safetensors file: {error}") from error
     if hashlib.sha256(data).hexdigest() != config.tensors_sha256:
         raise CheckpointError(file, f"not the file that {CONFIG_FILE} was written with: its SHA-256 differs")
@@ -159,7 +159,7 @@ def _read_config(file: Path) -> CheckpointConfig:
         raise CheckpointError(file, f"not JSON: {error}") from error
     version = content.get("format_version") if isinstance(content, dict) else None
     try:
-        # The version first: another one may have other fields, which are not what is wrong
+        # The version first: fields of another version are not the fault to report
         if isinstance(version, int):
             _format_version(version)
         return CheckpointConfig.model_validate(content)

@@ -1,4 +1,4 @@
-"""The one interface of everything that forecasts."""
+"""The interface of all forecasting models."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -13,25 +13,25 @@ from model.mixture import TrajectoryMixture
 from model.scenes.scene import STEP_SECONDS, AgentType, Scene
 
 Features: TypeAlias = dict[str, torch.Tensor]
-"""What a forward needs of each agent, by name; the first axis of every tensor is the agents'."""
+"""Inputs of a forward pass by name; the first axis of every tensor is the agents'."""
 
 
 class Context(StrEnum):
-    """Whether the forecast may look at map and neighbours."""
+    """The part of a scene that a forecast may use: all of it, or the agent's own history alone (blind)."""
 
     FULL = "full"
     BLIND = "blind"
 
 
 class Protocol(StrEnum):
-    """How derivatives in the training data were made (see docs of the contract's InputProtocol)."""
+    """The derivation of velocities and so on in the training data (see the contract's InputProtocol)."""
 
     CAUSAL = "causal"
     PAPER = "paper"
 
 
 class ModelInfo(BaseModel):
-    """What is known of a model; served by the model service and kept in a checkpoint's config."""
+    """Facts about a model, served by the model service and stored in a checkpoint's config."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", protected_namespaces=())
 
@@ -40,11 +40,11 @@ class ModelInfo(BaseModel):
     protocol: Protocol
     description: str
     agent_types: tuple[AgentType, ...]
-    """Types it forecasts."""
+    """Types that it forecasts."""
     context_types: tuple[AgentType, ...]
-    """Types it sees as neighbours."""
+    """Types that it sees as neighbours."""
     history_frames: int
-    """Frames of history used at most, now included."""
+    """Maximum number of history frames that it uses, now included."""
     steps: int = 12
     """Longest forecast, in steps of 0.5 s."""
     modes: int
@@ -57,7 +57,7 @@ class ModelInfo(BaseModel):
 
     @property
     def full_name(self) -> str:
-        """``name@version``, which names this model and no other."""
+        """``name@version``, unique to this model."""
         return f"{self.name}@{self.version}"
 
     @property
@@ -67,18 +67,24 @@ class ModelInfo(BaseModel):
 
 
 class Forecaster(ABC):
-    """Turns agents of a scene into Gaussian mixtures over their future positions.
+    """A model that forecasts agents of a scene as Gaussian mixtures over their future positions.
 
-    The work is in two halves, so that agents of many scenes can share one forward: ``prepare`` sees one
-    scene, ``forecast`` sees agents of one type from anywhere, joined by ``join``. Both are thread-safe.
+    Forecasting has two halves, so that agents of many scenes can share one forward pass: ``prepare`` takes
+    one scene, ``forecast`` takes agents of one type from any number of scenes, joined by ``join``. Both are
+    thread-safe.
     """
 
     info: ModelInfo
 
     @abstractmethod
     def prepare(self, scene: Scene, targets: Ints, context: Context = Context.FULL) -> Features:
-        """Features of the agents ``targets`` (indices [n] into the scene, all of one type that
-        ``info.agent_types`` names), each observed now."""
+        """Return the features of some agents.
+
+        Args:
+            scene: the scene.
+            targets: [n], indices of agents, all of one type in ``info.agent_types``, each observed now.
+            context: full or blind.
+        """
 
     @abstractmethod
     def forecast(
@@ -88,42 +94,42 @@ class Forecaster(ABC):
         context: Context = Context.FULL,
         steps: int | None = None,
     ) -> TrajectoryMixture:
-        """Mixtures of the agents in the features.
+        """Return the mixtures of the agents in the features.
 
         Args:
-            features: from ``prepare`` with the same context.
-            agent_type: the type of all of them.
+            features: result of ``prepare`` with the same context.
+            agent_type: the type of all agents.
             context: full or blind.
-            steps: T, at most ``info.steps``; default ``info.steps``.
+            steps: T, at most ``info.steps``; None: ``info.steps``.
         """
 
     def requires_heading(self, agent_type: AgentType) -> bool:
-        """Whether an agent of that type cannot be forecast without a heading now."""
+        """Return whether a forecast of an agent of that type needs its heading now."""
         return False
 
     def looks_at_map(self, agent_type: AgentType) -> bool:
-        """Whether forecasts of agents of that type depend on the map."""
+        """Return whether forecasts of agents of that type depend on the map."""
         return self.info.uses_map
 
     def looks_at_far_map(self, agent_type: AgentType) -> bool:
-        """Whether forecasts of agents of that type depend on a far map patch, too."""
+        """Return whether forecasts of agents of that type also depend on the far map patch."""
         return False
 
     def __call__(
         self, scene: Scene, targets: Ints, context: Context = Context.FULL, steps: int | None = None
     ) -> TrajectoryMixture:
-        """Both halves, for one scene; the targets must be of one type."""
+        """Forecast targets of one type in one scene: ``prepare``, then ``forecast``."""
         features = self.prepare(scene, targets, context)
         return self.forecast(features, scene.types[int(targets[0])], context, steps)
 
 
 def join(parts: Sequence[Features]) -> Features:
-    """Features of all agents of the parts, in order."""
+    """Concatenate the features of agents, in order."""
     if len(parts) == 1:
         return parts[0]
     return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
 
 
 def agent_count(features: Features) -> int:
-    """How many agents the features are of."""
+    """Return the number of agents in the features."""
     return len(next(iter(features.values())))

@@ -6,7 +6,7 @@ from model.arrays import Floats
 
 
 def wrap_angle(angle: Floats) -> Floats:
-    """Angles brought into [-π, π).
+    """Return angles wrapped into [-π, π).
 
     Args:
         angle: any shape, rad.
@@ -15,7 +15,7 @@ def wrap_angle(angle: Floats) -> Floats:
 
 
 def rotate(vectors: Floats, angle: Floats) -> Floats:
-    """Vectors turned counter-clockwise.
+    """Rotate vectors counter-clockwise.
 
     Args:
         vectors: [..., 2].
@@ -27,6 +27,6 @@ def rotate(vectors: Floats, angle: Floats) -> Floats:
 
 
 def rotation_matrices(angle: Floats) -> Floats:
-    """Matrices R with R @ v = v turned counter-clockwise by the angle: [..., 2, 2]."""
+    """Return matrices R for which R @ v is v rotated counter-clockwise by the angle: [..., 2, 2]."""
     cos, sin = np.cos(angle), np.sin(angle)
     return np.stack([np.stack([cos, -sin], axis=-1), np.stack([sin, cos], axis=-1)], axis=-2)

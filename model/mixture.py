@@ -10,9 +10,9 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class TrajectoryMixture:
-    """For each of N agents, K modes: a probability, and a 2-D Gaussian at each of T steps.
+    """K modes for each of N agents: a probability, and a 2-D Gaussian at each of T steps.
 
-    Positions are relative to ``origin``, which alone is float64: far from the ground frame's origin
+    Positions are relative to ``origin``, which is the only float64: far from the ground frame's origin,
     float32 would lose centimetres. A mode's weight holds for the whole trajectory; given the mode, the
     steps' densities multiply (Trajectron++, Salzmann et al. 2020, section 4).
     """
@@ -40,7 +40,7 @@ class TrajectoryMixture:
         return len(self.log_weights)
 
     def __getitem__(self, index: slice | Tensor) -> "TrajectoryMixture":
-        """Some of the agents."""
+        """Return the mixtures of some of the agents."""
         return TrajectoryMixture(
             self.log_weights[index], self.means[index], self.covariances[index], self.origin[index]
         )
@@ -52,16 +52,16 @@ class TrajectoryMixture:
         )
 
     def most_likely(self) -> Tensor:
-        """[N], the mode of greatest weight (the first of equals)."""
+        """Return the mode of greatest weight (the first of equals): [N]."""
         return self.log_weights.argmax(dim=-1)
 
     def most_likely_trajectory(self) -> Tensor:
-        """[N, T, 2] float64, the means of that mode, m, ground frame."""
+        """Return the means of the most likely mode: [N, T, 2] float64, m, ground frame."""
         modes = self.most_likely()
         return self.world_means[torch.arange(len(self)), modes]
 
     def component_log_density(self, positions: Tensor) -> Tensor:
-        """Log-density of each mode at each step, without the weights: [N, K, T].
+        """Return the log-density of each mode at each step, without the weights: [N, K, T].
 
         Args:
             positions: [N, T, 2] float64, m, ground frame.
@@ -71,7 +71,7 @@ class TrajectoryMixture:
         return guarded_log_density(offset, self.covariances)
 
     def log_density(self, positions: Tensor) -> Tensor:
-        """Log-density of the position at each step under the whole mixture: [N, T], 1/m² inside the log.
+        """Return the log-density of the position at each step: [N, T], 1/m² inside the log.
 
         Args:
             positions: [N, T, 2] float64, m, ground frame.
@@ -79,19 +79,19 @@ class TrajectoryMixture:
         return self.log_densities(positions[:, None])[:, 0]
 
     def log_densities(self, positions: Tensor) -> Tensor:
-        """``log_density`` of S trajectories an agent: [N, S, T].
+        """Return ``log_density`` of S trajectories of each agent: [N, S, T].
 
         Args:
             positions: [N, S, T, 2] float64, m, ground frame.
         """
         relative = (positions - self.origin[:, None, None, :]).to(self.means.dtype)
         offset = relative[:, :, None] - self.means[:, None]
-        # Of the covariances nothing is computed S times over
+        # What depends on the covariances alone is computed once, not S times
         joint = self.log_weights[:, None, :, None] + guarded_log_density(offset, self.covariances[:, None])
         return torch.logsumexp(joint, dim=2)
 
     def moments(self) -> tuple[Tensor, Tensor]:
-        """Mean [N, T, 2] (float64, ground frame) and covariance [N, T, 2, 2] of the whole mixture."""
+        """Return mean [N, T, 2] (float64, ground frame) and covariance [N, T, 2, 2] of the whole mixture."""
         weights = self.weights[:, :, None, None]
         mean = (weights * self.means).sum(1)
         offset = self.means - mean[:, None]
@@ -100,16 +100,16 @@ class TrajectoryMixture:
         return mean.double() + self.origin[:, None, :], covariance
 
     def sample(self, count: int, seeds: Sequence[int]) -> Tensor:
-        """Trajectories drawn from the mixture: [N, count, T, 2] float64, m, ground frame.
+        """Sample trajectories: [N, count, T, 2] float64, m, ground frame.
 
-        A trajectory follows one mode, drawn by weight; one standard normal vector goes through that
-        mode's Cholesky factors at all steps. Each step so has exactly the mixture's distribution, and
-        the path is smooth.
+        A trajectory follows one mode, drawn by weight. One standard normal vector is multiplied by that
+        mode's Cholesky factors at all steps. So each step has exactly the mixture's distribution, and the
+        path is smooth.
 
         Args:
-            count: trajectories of each agent.
-            seeds: N of them, one an agent, so that an agent's draws do not hang on what else is in the
-                batch. Equal seeds give equal noise: agents of one scene should get different ones.
+            count: number of trajectories of each agent.
+            seeds: N seeds, one for each agent, so that an agent's samples do not depend on the rest of the
+                batch. Equal seeds give equal noise: agents of one scene should have different ones.
         """
         modes, noise = [], []
         for weights, seed in zip(self.weights.cpu(), seeds, strict=True):
@@ -120,7 +120,7 @@ class TrajectoryMixture:
         factors = cholesky_2x2(self.covariances)
         drawn = self.means[rows, columns]  # [N, S, T, 2]
         one, another = torch.stack(noise)[:, :, None].unbind(-1)  # [N, S, 1] each
-        # By hand: a product of 2 × 2 matrices for every step of every sample takes longer
+        # Written out, because a 2 × 2 matrix product for every step of every sample is slower
         drawn[..., 0] += factors[..., 0, 0][rows, columns] * one
         drawn[..., 1] += factors[..., 1, 0][rows, columns] * one
         drawn[..., 1] += factors[..., 1, 1][rows, columns] * another
@@ -128,28 +128,28 @@ class TrajectoryMixture:
 
 
 MERGE_DISTANCE_M = 2.0
-"""m; modes nearer than this to a heavier one join it when modes are merged."""
+"""m; maximum distance of a mode from a heavier one that it is merged into."""
 MERGE_RELATIVE_DISTANCE = 0.2
-"""The same as a share of the way that the heavier mode has gone; the larger of both counts."""
+"""The same as a share of the distance that the heavier mode has gone; the larger of both applies."""
 
 
 @dataclass(frozen=True)
 class MergedModes:
-    """The few distinct modes that a mixture's K modes merge into, K' of them at most, and who became what.
+    """The distinct modes that a mixture's K modes merge into, at most K', and the group of each mode.
 
-    Agents may differ in how many distinct modes they have. An agent's places beyond ``counts`` are padding:
-    their weight is zero (log-weight −inf), and they repeat the agent's first merged mode, so that nothing
-    computed over all modes meets a place that no forecast names.
+    Agents may have different numbers of distinct modes. An agent's entries beyond ``counts`` are padding:
+    their weight is zero (log-weight −inf), and they repeat the agent's first merged mode, so that
+    computations over all modes meet only positions that a forecast names.
     """
 
     mixture: TrajectoryMixture
-    """[N, K'], in ascending order of the numbers of the modes that stand for the groups."""
+    """[N, K'], in ascending order of ``mode_ids``."""
     counts: Tensor
-    """[N] int64, how many merged modes each agent has."""
+    """[N] int64, number of merged modes of each agent."""
     mode_ids: Tensor
-    """[N, K'] int64, the number that each group's heaviest mode had before merging; −1 in padding."""
+    """[N, K'] int64, the index of each group's heaviest mode before merging; −1 in padding."""
     groups: Tensor
-    """[N, K] int64, the merged mode that each mode went into; −1 for one whose log-weight is −inf."""
+    """[N, K] int64, the merged mode of each mode; −1 for a mode whose log-weight is −inf."""
 
 
 def merge_modes(
@@ -157,23 +157,24 @@ def merge_modes(
     min_distance_m: float = MERGE_DISTANCE_M,
     relative_distance: float = MERGE_RELATIVE_DISTANCE,
 ) -> MergedModes:
-    """Merge modes that a planner would not tell apart, greedily by probability.
+    """Merge modes that a planner would not distinguish, greedily by probability.
 
-    The heaviest mode is kept, and those near it join it; of the rest the heaviest is kept, and so on (of
-    equal weights the lower number first). A mode is near a kept one if at every step their means are at
-    most max(min_distance_m, relative_distance · d) apart, d the distance of the kept mode's mean from the
-    origin, where the agent is now, at that step: two ways around an obstacle stay two though they end at
-    one place.
+    The heaviest mode is kept, and the modes near it join it; then the heaviest of the rest is kept, and so
+    on (the lower index first among equal weights). A mode is near a kept one if, at every step, their means
+    are at most max(min_distance_m, relative_distance · d) apart, where d is the distance of the kept mode's
+    mean from the origin (the agent's position now) at that step. So two ways around an obstacle remain two
+    modes although they end at the same place.
 
-    The members' weights add up. The kept mode's means stand for the group, because a weighted mean of
-    paths need not be one that can be driven; a group's covariance is its members' second moment about
-    those means. So the mixture's second moment about a group's path is preserved, its mean is not.
+    The weights of a group's members are summed. The kept mode's means represent the group, because a
+    weighted mean of paths may not be drivable. A group's covariance is its members' second moment about
+    those means. So the mixture's second moment about a group's path is preserved; its mean is not.
 
-    Merging merged modes may merge more: the summed weights can change who is heavier, and the way gone by
-    the heavier one decides. With ``relative_distance`` zero it changes nothing.
+    Merging merged modes again may merge more, because the summed weights can change which mode is heavier,
+    and the distance that the heavier one has gone decides. With ``relative_distance`` zero it changes
+    nothing.
 
     Args:
-        mixture: modes with log-weight −inf are left out, as the padding of merged modes is.
+        mixture: the mixture; modes with log-weight −inf (the padding of merged modes) are left out.
         min_distance_m: m, at least zero.
         relative_distance: at least zero.
 
@@ -182,33 +183,33 @@ def merge_modes(
     """
     if min_distance_m < 0 or relative_distance < 0:
         raise ValueError(f"distances to merge by must not be negative: {min_distance_m}, {relative_distance}")
-    # Modes by rank: the heaviest first, and of equals the lower number
+    # Modes by rank: the heaviest first, the lower index first among equals
     ranked, order = mixture.log_weights.sort(dim=-1, descending=True, stable=True)  # [N, K] each
     by_rank = _leaders(
         _of_modes(mixture.means, order), ranked != -math.inf, min_distance_m, relative_distance
     )
-    # Of each mode the number of the one that stands for it: ranks become numbers, then stand in their order
+    # The index of the mode that each mode joins: ranks become indices, in the original order of modes
     leaders = torch.empty_like(order).scatter_(1, order, order.gather(1, by_rank))
-    # What is no number stays, and shows in what is made of it
+    # NaN weights stay, so that they show in the result
     alive = mixture.log_weights != -math.inf
 
     numbers = torch.arange(order.shape[1], device=order.device)
     kept = alive & (leaders == numbers)
     counts = kept.sum(dim=-1)
     groups = (kept.cumsum(dim=-1) - 1).gather(1, leaders).masked_fill(~alive, -1)
-    most = int(counts.max()) if len(mixture) else 0
-    ids = kept.byte().argsort(dim=-1, descending=True, stable=True)[:, :most]  # The kept ones come first
-    padding = numbers[:most] >= counts[:, None]
+    max_count = int(counts.max()) if len(mixture) else 0
+    ids = kept.byte().argsort(dim=-1, descending=True, stable=True)[:, :max_count]  # the kept ones come first
+    padding = numbers[:max_count] >= counts[:, None]
     ids = torch.where(padding, ids[:, :1], ids)
 
-    # Weights against the heaviest member's, so that a mode that nothing joins keeps its own to the last bit
+    # Relative to the heaviest member's weight, so that a mode that nothing joins keeps its weight bit by bit
     heaviest = mixture.log_weights.gather(1, leaders)
     relative = (mixture.log_weights - heaviest).exp().masked_fill(~alive, 0.0)
     totals = torch.zeros_like(relative).scatter_add_(1, leaders, relative)
     log_weights = (mixture.log_weights + totals.log()).gather(1, ids).masked_fill(padding, -math.inf)
-    shares = relative / totals.gather(1, leaders).clamp_min(1.0)  # At least 1 but for the left out
+    shares = relative / totals.gather(1, leaders).clamp_min(1.0)  # at least 1, except for modes left out
 
-    offset = mixture.means - _of_modes(mixture.means, leaders)  # Of each mode from its group's path
+    offset = mixture.means - _of_modes(mixture.means, leaders)  # of each mode from its group's path
     moments = mixture.covariances + offset[..., :, None] * offset[..., None, :]
     moments *= shares[..., None, None, None]
     covariances = torch.zeros_like(moments)
@@ -227,51 +228,51 @@ def merge_modes(
 
 
 def _of_modes(values: Tensor, modes: Tensor) -> Tensor:
-    """Return what ``values`` [N, K, ...] hold of some modes of each agent, ``modes`` [N, J]: [N, J, ...]."""
-    # Whole rows are copied, which takes a third of the time that indexing by agent and mode takes
+    """Select modes [N, J] of each agent from ``values`` [N, K, ...]: [N, J, ...]."""
+    # Copying whole rows takes a third of the time of indexing by agent and mode
     rows = values.flatten(0, 1).index_select(0, _rows(modes, values.shape[1]))
     return rows.view(*modes.shape, *values.shape[2:])
 
 
 def _rows(modes: Tensor, count: int) -> Tensor:
-    """Return where modes [N, J] of N agents stand when agents and modes are one axis: [N · J]."""
+    """Return the positions of modes [N, J] when agents and their ``count`` modes are one axis: [N · J]."""
     return (torch.arange(len(modes), device=modes.device)[:, None] * count + modes).flatten()
 
 
 def _leaders(means: Tensor, alive: Tensor, min_distance_m: float, relative_distance: float) -> Tensor:
-    """Return the rank of the kept mode that each mode joins, a kept one's own: [N, K].
+    """Return the rank of the kept mode that each mode joins (its own for a kept mode): [N, K].
 
     Args:
         means: [N, K, T, 2], by descending weight.
-        alive: [N, K], modes that have any weight; the others join nothing and nothing joins them.
-        min_distance_m: as of ``merge_modes``.
-        relative_distance: as of ``merge_modes``.
+        alive: [N, K], modes of non-zero weight; the others neither join a mode nor are joined.
+        min_distance_m: as in ``merge_modes``.
+        relative_distance: as in ``merge_modes``.
     """
-    # A step at a time and agents last: what is at work stays in the cache, and loops run over many agents
+    # One step at a time and agents last: the working set fits the CPU cache, and inner loops run over agents
     x, y = means.permute(3, 2, 1, 0).contiguous()  # [T, K, N] each
     allowed = (relative_distance * torch.hypot(x, y)).clamp_min(min_distance_m).square()
-    # What overflows is near nothing, or covariances would overflow, too
+    # A distance that overflows is near nothing: otherwise covariances would overflow, too
     allowed.clamp_(max=torch.finfo(allowed.dtype).max)
     near = torch.ones(x.shape[1], *x.shape[1:], dtype=torch.bool, device=x.device)
-    for east, north, most in zip(x, y, allowed, strict=True):
+    for east, north, bound in zip(x, y, allowed, strict=True):
         squared = (east[:, None] - east).square_()  # [K, K, N]
         squared += (north[:, None] - north).square_()
-        near &= squared <= most[:, None]
+        near &= squared <= bound[:, None]
     free = alive.T.clone()
-    for rank, joins in enumerate(near):  # joins is a view: what is near becomes what joins
+    for rank, joins in enumerate(near):  # a view: row by row, near becomes joins
         joins.logical_and_(free).logical_and_(free[rank])
         free.logical_xor_(joins)
     numbers = torch.arange(len(near), device=near.device)
-    leaders = (near * numbers[:, None, None]).amax(dim=0).T  # Of a mode's column one place is set at most
+    leaders = (near * numbers[:, None, None]).amax(dim=0).T  # at most one entry of a mode's column is set
     return torch.where(alive, leaders, numbers)
 
 
 def cholesky_2x2(covariances: Tensor) -> Tensor:
-    """Lower factors of positive (semi-)definite 2 × 2 matrices: [..., 2, 2] → [..., 2, 2].
+    """Return the lower Cholesky factors of positive (semi-)definite 2 × 2 matrices: [..., 2, 2].
 
-    In closed form: rounding may leave a tiny negative pivot, which is cut at zero, where
+    The closed form clamps a tiny negative pivot, which rounding may leave, at zero;
     ``torch.linalg.cholesky`` would raise. No element of a factor is larger than its row's standard
-    deviation, so a variance that has underflowed to zero does no harm either.
+    deviation, so that a variance which underflows to zero is harmless, too.
     """
     l11 = covariances[..., 0, 0].clamp_min(0).sqrt()
     largest = covariances[..., 1, 1].clamp_min(0).sqrt()
@@ -283,13 +284,13 @@ def cholesky_2x2(covariances: Tensor) -> Tensor:
 
 
 MIN_VARIANCE = 1e-8
-"""m², of a density; below it a variance counts as this."""
+"""m²; minimum variance in a density."""
 MIN_DECORRELATION = 1e-5
-"""1 − ρ², of a density; below it an ellipse counts as this slim."""
+"""Minimum of 1 − ρ² in a density."""
 
 
 def guarded_log_density(offset: Tensor, covariance: Tensor) -> Tensor:
-    """Log-density of Gaussians that may be degenerate: [...], always finite.
+    """Return the log-density of Gaussians that may be degenerate: [...], always finite.
 
     A step whose spread comes from one control alone has a covariance of rank one. As in the released
     Trajectron++, variances and 1 − ρ² are bounded from below.

@@ -19,27 +19,27 @@ from model.mixture import TrajectoryMixture
 from model.scenes.scene import STEP_SECONDS, AgentType, Scene
 
 HISTORY_FRAMES = 5
-"""Frames that the filter runs over: 2 s, the history of nuScenes' challenge."""
+"""Frames that the filter runs over: 2 s, as in the nuScenes prediction challenge."""
 
 
 @dataclass(frozen=True)
 class Noise:
-    """What the filter assumes, for each axis."""
+    """The filter's assumptions, for each axis."""
 
     acceleration_density: float
     """m²/s³, power spectral density of the white acceleration, from ``_MOVING_SPEED`` on."""
     measurement: float
     """m, standard deviation of a measured position."""
     given_velocity: float
-    """m/s, standard deviation of the velocity that an agent seen only once came with."""
+    """m/s, standard deviation of the given velocity of an agent with a single observation."""
     standing_density: float | None = None
-    """m²/s³, that of an agent that stays below ``_STANDING_SPEED``; None: as that of a moving one."""
+    """m²/s³, ``acceleration_density`` of an agent below ``_STANDING_SPEED``; None: as of a moving one."""
 
     def density(self, speed: Tensor) -> Tensor:
-        """Power spectral density, [N] m²/s³: linear between standing and moving.
+        """Return the power spectral density, linear between standing and moving: [N], m²/s³.
 
         Args:
-            speed: [N], m/s, the highest in the history.
+            speed: [N], m/s, maximum over the history.
         """
         moving = torch.full_like(speed, self.acceleration_density)
         if self.standing_density is None:
@@ -58,22 +58,22 @@ NOISE: Mapping[AgentType, Noise] = {
     AgentType.CYCLIST: _ANY_SPEED,
     AgentType.UNKNOWN: _ANY_SPEED,
 }
-"""Density and measurement noise: fitted for vehicles and pedestrians to the data that
-``model.baselines.uncertainty`` names, by minimising the same likelihood of the forecast positions at 0.5, 1,
-… 6 s. The velocity's and all of cyclists and unknown agents are assumptions.
+"""Noise by agent type. For vehicles and pedestrians, density and measurement noise are fitted to the data
+that ``model.baselines.uncertainty`` names, by maximum likelihood of the forecast positions at 0.5, 1, … 6 s.
+The noise of given velocities, and all of cyclists and unknown agents, are assumptions.
 
-The density of standing vehicles is the likeliest of nine tried on those of v1.0-mini: 0.003 up to 0.1 m/s,
-0.01 up to 0.3 m/s. With that of moving ones a parked car's σ would be 8.8 m at 6 s instead of 0.9 m; 99 %
-of its true positions lie in the 90 % ellipses, where all did. What the filter says of moving vehicles
-holds: at 3 to 10 m/s, on train_val, 94, 91, 88, 86, 83 and 82 % at 1, 2, … 6 s."""
+The density of standing vehicles is the most likely of nine values on those of v1.0-mini: 0.003 up to 0.1 m/s,
+0.01 up to 0.3 m/s. With the density of moving vehicles, a parked car's σ would be 8.8 m at 6 s instead of
+0.9 m, and all of its true positions would lie in the 90 % ellipses instead of 99 %. Coverage of moving
+vehicles: at 3 to 10 m/s, on train_val, 94, 91, 88, 86, 83 and 82 % at 1, 2, … 6 s."""
 
 
 class Kalman(Forecaster):
-    """One forecast for each agent: the filtered position carried on at the filtered velocity.
+    """The filtered position, extrapolated at the filtered velocity: one mode for each agent.
 
-    The covariance is that of the true position; noise of measuring it again is not in it. The first two
-    frames give the first state (their difference is the velocity). With one frame only, the velocity is the
-    one it came with, or zero.
+    The covariance is that of the true position, without the noise of measuring it. The first two frames give
+    the first state (their difference is the velocity). An agent with a single frame has the velocity given
+    with it, or zero.
     """
 
     info = ModelInfo(
@@ -93,8 +93,11 @@ class Kalman(Forecaster):
     )
 
     def prepare(self, scene: Scene, targets: Ints, context: Context = Context.FULL) -> Features:
-        """``origin`` [n, 2], the position now; ``positions`` [n, 5, 2] relative to it, oldest first, zero
-        before ``first`` [n]; ``velocity`` [n, 2] now. Float64.
+        """Return the positions of the history.
+
+        Returns:
+            Float64: ``origin`` [n, 2], the position now; ``positions`` [n, 5, 2] relative to it, oldest
+            first, zero before ``first`` [n]; ``velocity`` [n, 2] now.
 
         Raises:
             ValueError: a target is not observed now.
@@ -103,7 +106,7 @@ class Kalman(Forecaster):
         require_observed(states, targets)
         missing = HISTORY_FRAMES - states.frames
         origin = states.position[targets, -1]
-        # Always five frames, however many the scene has, so that scenes can be joined
+        # Always five frames, even if the scene has fewer, so that agents of many scenes can be joined
         positions = np.zeros((len(targets), HISTORY_FRAMES, 2))
         positions[:, missing:] = np.nan_to_num(states.position[targets] - origin[:, None])
         return {
@@ -120,7 +123,7 @@ class Kalman(Forecaster):
         context: Context = Context.FULL,
         steps: int | None = None,
     ) -> TrajectoryMixture:
-        """One mode an agent; see the class. Context makes no difference.
+        """Return one mode for each agent; the context makes no difference.
 
         Raises:
             ValueError: steps outside 1 … 12.
@@ -151,7 +154,7 @@ class _State:
 
 @dataclass(frozen=True)
 class _Covariance:
-    """Of (position, velocity) along one axis, each [N] or [N, T]."""
+    """Covariances of (position, velocity) along one axis, each [N] or [N, T]."""
 
     var_position: Tensor
     both: Tensor
@@ -159,9 +162,9 @@ class _Covariance:
 
 
 def _predict(state: _State, time: Tensor, density: Tensor) -> _Covariance:
-    """The covariance a while later: [N, T] for times [T], s.
+    """Return the covariance at later times [T], s: [N, T].
 
-    A sum of terms of which each is positive semi-definite, so it stays so.
+    It is a sum of positive semi-definite terms, so that it is positive semi-definite, too.
     """
     now = state.covariance
     position, both, velocity = now.var_position[:, None], now.both[:, None], now.var_velocity[:, None]
@@ -174,7 +177,9 @@ def _predict(state: _State, time: Tensor, density: Tensor) -> _Covariance:
 
 
 def _top_speed(positions: Tensor, first: Tensor, velocity: Tensor) -> Tensor:
-    """[N], m/s, the highest speed from the first observed frame on: who has just stopped does not stand yet.
+    """Return the maximum speed since the first observed frame: [N], m/s.
+
+    So an agent that has just stopped does not count as standing yet.
 
     Args:
         positions: [N, F, 2], m.
@@ -187,14 +192,14 @@ def _top_speed(positions: Tensor, first: Tensor, velocity: Tensor) -> Tensor:
 
 
 def _filter(positions: Tensor, first: Tensor, velocity: Tensor, noise: Noise, density: Tensor) -> _State:
-    """Runs over the frames from the first observed one on.
+    """Run the filter over the frames, from the first observed one on.
 
     Args:
         positions: [N, F, 2], m.
         first: [N], first observed frame.
         velocity: [N, 2], m/s, now; used where only the last frame is observed.
-        noise: of the agents' type.
-        density: [N], m²/s³, of the white acceleration.
+        noise: noise of the agents' type.
+        density: [N], m²/s³, power spectral density of the acceleration.
     """
     frames = positions.shape[1]
     state = _seen_once(positions[:, -1], velocity, noise)
@@ -207,7 +212,7 @@ def _filter(positions: Tensor, first: Tensor, velocity: Tensor, noise: Noise, de
 
 
 def _seen_once(position: Tensor, velocity: Tensor, noise: Noise) -> _State:
-    """The state of an agent of which there is one position, and a velocity from elsewhere."""
+    """Return the state of an agent with one position and a given velocity."""
     one = torch.ones_like(position[:, 0])
     return _State(
         position, velocity, _Covariance(one * noise.measurement**2, 0 * one, one * noise.given_velocity**2)
@@ -215,7 +220,7 @@ def _seen_once(position: Tensor, velocity: Tensor, noise: Noise) -> _State:
 
 
 def _seen_twice(before: Tensor, now: Tensor, noise: Noise, density: Tensor) -> _State:
-    """The state from two positions and nothing else (the filter's limit for an unknown first velocity)."""
+    """Return the state from two positions (the filter's limit for an unknown first velocity)."""
     one = torch.ones_like(now[:, 0])
     measured = noise.measurement**2
     velocity = 2 * measured / STEP_SECONDS**2 + density * STEP_SECONDS / 3
@@ -227,7 +232,7 @@ def _seen_twice(before: Tensor, now: Tensor, noise: Noise, density: Tensor) -> _
 
 
 def _update(state: _State, measured: Tensor, noise: Noise, density: Tensor) -> _State:
-    """One frame on: prediction, then correction by the measured position [N, 2]."""
+    """Advance by one frame: prediction, then correction by the measured position [N, 2]."""
     step = torch.full((1,), STEP_SECONDS, dtype=measured.dtype, device=measured.device)
     ahead = _predict(state, step, density)
     position, both, velocity = ahead.var_position[:, 0], ahead.both[:, 0], ahead.var_velocity[:, 0]
@@ -238,7 +243,7 @@ def _update(state: _State, measured: Tensor, noise: Noise, density: Tensor) -> _
     return _State(
         expected + gain_position[:, None] * surprise,
         state.velocity + gain_velocity[:, None] * surprise,
-        # The usual (I − K H) P, written so that only the last number is a difference.
+        # (I − K H) P, written so that only the last number is a difference
         _Covariance(
             gain_position * noise.measurement**2,
             gain_velocity * noise.measurement**2,
@@ -248,7 +253,7 @@ def _update(state: _State, measured: Tensor, noise: Noise, density: Tensor) -> _
 
 
 def _choose(mask: Tensor, one: _State, other: _State) -> _State:
-    """Agent by agent, the first state where the mask [N] is set, else the second."""
+    """Return one state where the mask [N] is set, else the other."""
     a, b = one.covariance, other.covariance
     return _State(
         torch.where(mask[:, None], one.position, other.position),

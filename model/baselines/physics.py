@@ -1,10 +1,10 @@
-"""The physics baselines: an agent goes on as it moves now.
+"""The physics baselines: an agent continues its present motion.
 
-As in nuScenes' prediction baselines (nuscenes-devkit, ``prediction/models/physics.py``), with three
-differences. A turn is the exact arc, not a polygon of Euler steps. Agents that brake stop and stay, where
-the devkit lets them reverse and speed up backwards. The direction of travel is that of the velocity, and
-the heading only tells it for an agent that stands; so one that reverses goes on reversing, where the devkit
-drives it forwards.
+They follow nuScenes' prediction baselines (nuscenes-devkit, ``prediction/models/physics.py``), with three
+differences. A turn is an exact arc instead of a polygon of Euler steps. Agents that brake stop and stay,
+while the devkit lets them reverse and accelerate backwards. The direction of travel is that of the velocity,
+and the heading replaces it only for an agent that stands; so a reversing agent continues to reverse, while
+the devkit drives it forwards.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,26 +22,27 @@ from model.mixture import TrajectoryMixture
 from model.scenes.scene import AgentType, Scene
 
 STANDING_SPEED = 1e-6
-"""m/s; up to it the velocity has no direction, and the agent would set off along its heading."""
+"""m/s; up to this speed the velocity has no direction, and the heading replaces it."""
 HEADING_SPEED = 0.5
-"""m/s; below it the stated ellipse lies along the heading: the velocity's direction is mostly noise."""
+"""m/s; below this speed the ellipse is aligned with the heading: the velocity's direction is mostly noise."""
 
 _SERIES_LIMIT = 1e-2
-"""rad; below it the arc's second integral is summed as a series, exact to a double's last digits."""
+"""rad; below this angle the arc's second integral is a series, exact to the last digits of a double."""
 
 
 class Physics(Forecaster):
-    """One forecast for each agent: constant velocity or acceleration, constant yaw or yaw rate.
+    """Constant velocity or acceleration, constant yaw or yaw rate: one mode for each agent.
 
-    The acceleration is that along the direction of travel, held until the agent stops. What is not known
-    (NaN) of velocity, acceleration and heading rate counts as zero; an unknown heading is the direction of
-    the velocity. The covariance is ``uncertainty``'s, aligned with the direction of travel at each step.
+    The acceleration is the one along the direction of travel, constant until the agent stops. Unknown (NaN)
+    velocities, accelerations and heading rates count as zero; an unknown heading is the direction of the
+    velocity. The covariance comes from ``model.baselines.uncertainty``, aligned with the direction of travel
+    at each step.
 
     Args:
-        name: of the model.
-        accelerates: whether the acceleration goes on; else the speed stays.
-        turns: whether the heading rate goes on; else the direction stays.
-        spread: how the error grows, by agent type and speed.
+        name: name of the model.
+        accelerates: whether the acceleration stays constant; otherwise the speed does.
+        turns: whether the heading rate stays constant; otherwise the direction does.
+        spread: growth of the error, by agent type and speed.
     """
 
     def __init__(
@@ -69,8 +70,11 @@ class Physics(Forecaster):
         )
 
     def prepare(self, scene: Scene, targets: Ints, context: Context = Context.FULL) -> Features:
-        """The present state, float64: ``position``, ``velocity``, ``acceleration`` [n, 2], ``heading`` (NaN
-        where unknown) and ``heading_rate`` [n].
+        """Return the present state.
+
+        Returns:
+            Float64: ``position``, ``velocity``, ``acceleration`` [n, 2], ``heading`` (NaN where unknown)
+            and ``heading_rate`` [n].
 
         Raises:
             ValueError: a target is not observed now.
@@ -92,7 +96,7 @@ class Physics(Forecaster):
         context: Context = Context.FULL,
         steps: int | None = None,
     ) -> TrajectoryMixture:
-        """One mode an agent; see the class. Context makes no difference.
+        """Return one mode for each agent; the context makes no difference.
 
         Raises:
             ValueError: steps outside 1 … 12.
@@ -129,13 +133,13 @@ def baselines() -> Sequence[Physics]:
 
 
 def _time_to_stop(speed: Tensor, acceleration: Tensor) -> Tensor:
-    """[N], s; infinite for an agent that does not brake."""
+    """Return the time until an agent stops: [N], s; infinite for an agent that does not brake."""
     braking = acceleration < 0
     return torch.where(braking, speed / torch.where(braking, -acceleration, 1.0), torch.inf)
 
 
 def _travel(speed: Tensor, acceleration: Tensor, time: Tensor, turned: Tensor) -> Tensor:
-    """Way travelled from rest at the origin's heading 0: ∫ (speed + acceleration · τ) e^{i ω τ} dτ over time.
+    """Return the displacement at heading 0 now: ∫ (speed + acceleration · τ) e^{i ω τ} dτ over time.
 
     Args:
         speed: [N, 1], m/s, at time 0.
@@ -149,7 +153,7 @@ def _travel(speed: Tensor, acceleration: Tensor, time: Tensor, turned: Tensor) -
     # ∫ e^{i x u} du over [0, 1] is the chord of the arc: sinc(x/2) long, at the angle x/2.
     chord = torch.special.sinc(turned / (2 * torch.pi))
     first = torch.stack([chord * torch.cos(turned / 2), chord * torch.sin(turned / 2)], dim=-1)
-    # ∫ u e^{i x u} du, by parts; the closed form cancels where x is small.
+    # ∫ u e^{i x u} du, by parts; the closed form suffers cancellation where x is small.
     small = turned.abs() < _SERIES_LIMIT
     x = torch.where(small, 1.0, turned)
     real = torch.where(small, 1 / 2 - turned**2 / 8 + turned**4 / 144, (x.cos() + x * x.sin() - 1) / x**2)
@@ -159,7 +163,7 @@ def _travel(speed: Tensor, acceleration: Tensor, time: Tensor, turned: Tensor) -
 
 
 def _rotate(vectors: Tensor, angle: Tensor) -> Tensor:
-    """Vectors [N, T, 2] turned counter-clockwise by the angle [N, 1], rad."""
+    """Rotate vectors [N, T, 2] counter-clockwise by angles [N, 1], rad."""
     x, y = vectors[..., 0], vectors[..., 1]
     cos, sin = angle.cos(), angle.sin()
     return torch.stack([cos * x - sin * y, sin * x + cos * y], dim=-1)

@@ -1,30 +1,34 @@
-"""The covariance that single-trajectory baselines state.
+"""The covariance of the baselines, which forecast a single trajectory.
 
 The error of such a forecast grows with the time t ahead as
 
     σ²(t) = position² + (velocity · t)² + (acceleration · t² / 2)²
 
-that is as if the position, velocity and acceleration that it goes on from were each off by an independent
-error of that standard deviation. Along the direction of travel and across it the three numbers differ, and
-for vehicles they change with the speed now: linearly between the speeds of a table, and not at all beyond its
-ends. A car that stands mostly stays, one that creeps may do anything, one that drives fast keeps its course.
+as if the position, velocity and acceleration now had independent errors of these standard deviations. The
+three numbers differ along the direction of travel and across it. For vehicles they also depend on the speed
+now: they are linear between the speeds of a table and constant beyond its ends. A standing car mostly stays,
+a creeping one may do anything, and a fast one keeps its course.
 
-Where the numbers come from. Vehicles from 0.6 m/s on: 28865 (agent, time) pairs of the nuScenes prediction
-challenge, split train, causal protocol (2 Hz label positions, backward differences over 0.5 s, nothing from
-the future). Slower vehicles: 2622 pairs of v1.0-mini, of all vehicles that are annotated from 2 s before to
-6 s after, because the challenge asks about movers: of its pairs that stood for 2 s 40 % move by more than 2
-m within 3 s, of the mini scenes' 0.4 %. One Gaussian cannot be right for both; that of a standing vehicle
-is right for everyday ones. Pedestrians: 1004 pairs with 2 s of history and 6 s of future of the eight
-training scenes of v1.0-mini, of those who had moved by at least 0.5 m within the 2 s. For each baseline,
-axis and type the numbers minimise the Gaussian negative log-likelihood Σ [ln σ²(t) + e²(t) / σ²(t)] of the
-errors e at t = 0.5, 1, … 6 s, all pairs and times weighing the same, but for the slow vehicles', which
-together weigh 0.05 of the faster ones'; a fitted 0 says that the others explain it all. By hand: at 0 m/s a
-position of 5 cm, which annotations do not have, and 0.3 m across at 6 s instead of the fitted 0.13 to 0.22
-m.
+Sources of the numbers:
 
-Share (%) of true positions in the 90 % ellipse at 1, 2, … 6 s, constant velocity & yaw, of train_val, which
-no number was fitted to, and of v1.0-mini below 0.25 m/s, which those of slow vehicles were fitted to.
-Before, one width served every speed; a standing car's ellipse was 13 m by 9 m (σ).
+- Vehicles from 0.6 m/s on: 28865 (agent, time) pairs of the nuScenes prediction challenge, split train,
+  causal protocol (2 Hz label positions, backward differences over 0.5 s, nothing from the future).
+- Slower vehicles: 2622 pairs of v1.0-mini, of all vehicles that are annotated from 2 s before to 6 s after.
+  The challenge selects vehicles that move: 40 % of its pairs that stood for 2 s move by more than 2 m within
+  3 s, but 0.4 % of those of the mini scenes. No single Gaussian fits both; the one of standing vehicles fits
+  everyday ones.
+- Pedestrians: 1004 pairs with 2 s of history and 6 s of future from the eight training scenes of v1.0-mini,
+  of pedestrians that had moved by at least 0.5 m within the 2 s.
+
+For each baseline, axis and type the numbers minimise the Gaussian negative log-likelihood
+Σ [ln σ²(t) + e²(t) / σ²(t)] of the errors e at t = 0.5, 1, … 6 s. All pairs and times have equal weights,
+except that slow vehicles together have 0.05 of the weight of the faster ones. A fitted 0 means that the other
+numbers explain the error. Two numbers at 0 m/s are set by hand: a position error of 5 cm, which annotations
+do not have, and 0.3 m across at 6 s instead of the fitted 0.13 to 0.22 m.
+
+Share (%) of true positions in the 90 % ellipse at 1, 2, … 6 s, constant velocity & yaw: of train_val, which
+no number was fitted to, and of v1.0-mini below 0.25 m/s, which the numbers of slow vehicles were fitted to.
+Previously all speeds shared one width, and a standing car's ellipse was 13 m by 9 m (σ).
 
     speed, m/s          before                     now
     0 to 0.05, mini     100 100 100 100 100 100    98 98 98 99 99 99
@@ -35,11 +39,11 @@ Before, one width served every speed; a standing car's ellipse was 13 m by 9 m (
     6 to 10             88 86 86 86 86 87          90 87 86 86 87 88
     10 to 15            88 87 88 89 88 88          89 85 83 81 80 80
 
-The challenge's pairs below 0.3 m/s, 606 of 8560, are about to start: 73, 56, 40, 24, 11 and 3 % of their
-true positions lie in a standing vehicle's ellipses, where 98 % lay in the wide ones; many at 0.3 to 1 m/s
-are, too. Real errors have heavier tails than a Gaussian.
+The challenge's pairs below 0.3 m/s, 606 of 8560, are about to start, as are many at 0.3 to 1 m/s: 73, 56, 40,
+24, 11 and 3 % of their true positions lie in the ellipses of a standing vehicle, while 98 % lay in the
+previous, wide ones. Real errors have heavier tails than a Gaussian.
 
-Not fitted to speeds: cyclists and agents of unknown type, which are assumed to be like vehicles at any speed.
+Cyclists and agents of unknown type are assumed to have the errors of vehicles, independent of their speed.
 """
 
 import math
@@ -64,7 +68,7 @@ class Growth:
     """m/s²."""
 
     def variance(self, time: Tensor) -> Tensor:
-        """Variance, m², at times ahead, s; any shape."""
+        """Return the variance, m², at times ahead, s; any shape."""
         return self.position**2 + (self.velocity * time) ** 2 + (self.acceleration * time**2 / 2) ** 2
 
 
@@ -78,21 +82,21 @@ class Spread:
 
 @dataclass(frozen=True)
 class SpreadBySpeed:
-    """Error growth of agents by their speed now: the numbers change linearly from speed to speed."""
+    """Error growth of agents by their speed now, linear between the speeds of a table."""
 
     speeds: tuple[float, ...]
     """m/s, ascending."""
     spreads: tuple[Spread, ...]
-    """At these speeds; the first one below them, the last one above."""
+    """Spreads at these speeds; the first also applies below them, the last above."""
 
     def variances(self, speed: Tensor, time: Tensor) -> tuple[Tensor, Tensor]:
-        """Variances along and across, m², each [N, T].
+        """Return the variances along and across, m², each [N, T].
 
         Args:
             speed: [N], m/s.
             time: [T], s ahead.
         """
-        # How much each speed of the table counts: [N, K]
+        # Weight of each speed of the table: [N, K]
         shares = torch.ones_like(speed)[:, None]
         if len(self.speeds) > 1:
             table = torch.tensor(self.speeds, dtype=speed.dtype, device=speed.device)
@@ -110,13 +114,13 @@ class SpreadBySpeed:
 
 
 def aligned_covariance(spread: SpreadBySpeed, speed: Tensor, time: Tensor, direction: Tensor) -> Tensor:
-    """Covariances of forecasts whose errors are independent along and across a direction.
+    """Return covariances of forecasts whose errors are independent along and across a direction.
 
     Args:
-        spread: the growth along and across.
+        spread: error growth along and across.
         speed: [N], m/s, now.
         time: [T], s ahead.
-        direction: [N, T], rad: of travel, at each time.
+        direction: [N, T], rad, direction of travel at each time.
 
     Returns:
         [N, T, 2, 2], m², symmetric and positive definite.
@@ -126,7 +130,7 @@ def aligned_covariance(spread: SpreadBySpeed, speed: Tensor, time: Tensor, direc
 
 
 def oriented_covariance(along: Tensor, across: Tensor, direction: Tensor) -> Tensor:
-    """Covariances of what is independent along and across a direction.
+    """Return covariances of errors that are independent along and across a direction.
 
     Args:
         along: [T] or [N, T], m², variance along it.
@@ -144,10 +148,10 @@ def oriented_covariance(along: Tensor, across: Tensor, direction: Tensor) -> Ten
 
 
 def ellipse_radius(probability: float) -> float:
-    """How many standard deviations the ellipse reaches that holds this share of a 2-D Gaussian.
+    """Return the radius, in standard deviations, of the ellipse that contains a share of a 2-D Gaussian.
 
     Args:
-        probability: in [0, 1).
+        probability: the share, in [0, 1).
     """
     return math.sqrt(-2 * math.log1p(-probability))
 
@@ -155,12 +159,12 @@ def ellipse_radius(probability: float) -> float:
 def for_every_type(
     vehicle: Sequence[Spread], pedestrian: Spread, other: Spread
 ) -> Mapping[AgentType, SpreadBySpeed]:
-    """A spread for every type.
+    """Return the spread of every type.
 
     Args:
-        vehicle: at each of ``VEHICLE_SPEEDS``.
-        pedestrian: at any speed.
-        other: of cyclists and unknown agents, at any speed.
+        vehicle: spread at each of ``VEHICLE_SPEEDS``.
+        pedestrian: spread at any speed.
+        other: spread of cyclists and unknown agents at any speed.
     """
     at_any_speed = SpreadBySpeed((0.0,), (other,))
     return {
@@ -172,7 +176,7 @@ def for_every_type(
 
 
 VEHICLE_SPEEDS = (0.0, 0.25, 1.0, 3.0, 6.0, 12.0)
-"""m/s; what vehicles' numbers are given for. From about 12 m/s on there are too few pairs to tell more."""
+"""m/s, speeds of the vehicles' table. There are too few pairs from about 12 m/s on for more speeds."""
 
 CONSTANT_VELOCITY_YAW = for_every_type(
     vehicle=(

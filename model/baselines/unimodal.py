@@ -1,4 +1,4 @@
-"""What baselines that forecast a single trajectory share."""
+"""Parts shared by the baselines, which forecast a single trajectory."""
 
 import torch
 from torch import Tensor
@@ -10,10 +10,10 @@ from model.scenes.scene import STEP_SECONDS, AgentStates
 
 
 def require_observed(states: AgentStates, targets: Ints) -> None:
-    """Refuses agents without a present.
+    """Refuse agents that are not observed now.
 
     Args:
-        states: of the scene.
+        states: states of the scene's agents.
         targets: [n], indices of agents.
 
     Raises:
@@ -25,11 +25,11 @@ def require_observed(states: AgentStates, targets: Ints) -> None:
 
 
 def step_times(info: ModelInfo, steps: int | None) -> Tensor:
-    """When the steps of a forecast are: [T] float64, s ahead.
+    """Return the times of a forecast's steps: [T] float64, s ahead.
 
     Args:
-        info: of the model.
-        steps: T; None for all that the model has.
+        info: facts about the model.
+        steps: T; None: ``info.steps``.
 
     Raises:
         ValueError: steps outside 1 … info.steps.
@@ -41,7 +41,7 @@ def step_times(info: ModelInfo, steps: int | None) -> Tensor:
 
 
 def unimodal(means: Tensor, covariances: Tensor, origin: Tensor) -> TrajectoryMixture:
-    """A mixture of one mode.
+    """Return a mixture of one mode.
 
     Args:
         means: [N, T, 2], m, relative to origin.

@@ -1,1 +1,1 @@
-"""The conditional variational autoencoder of Trajectron++, CAB, Reweight and RUBiZ."""
+"""The networks: the CVAE of Trajectron++, CAB, Reweight and RUBiZ, CoverNet, and their forecasters."""

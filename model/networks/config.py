@@ -1,4 +1,4 @@
-"""What shape of network a checkpoint holds."""
+"""Configurations of networks, as checkpoints hold them."""
 
 from enum import StrEnum
 from typing import Annotated, Any, Literal, TypeAlias
@@ -16,18 +16,18 @@ DECODER_HIDDEN = 128
 
 
 class BlindContext(StrEnum):
-    """How the network forecasts from an agent's own history alone."""
+    """The way a network forecasts from an agent's own history alone."""
 
     NONE = "none"
-    """It cannot (Trajectron++, HalentNet)."""
+    """No blind forecast (Trajectron++, HalentNet)."""
     NULL = "null"
-    """The same network, on a null context (CAB, section 3)."""
+    """The same network with a null context (CAB, section 3)."""
     OWN = "own"
     """A second latent and decoder on the history encoding (released Reweight and RUBiZ)."""
 
 
 class NetworkConfig(BaseModel):
-    """A CVAE for each agent type; they share no parameters."""
+    """A CVAE for each agent type; types share no parameters."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -35,23 +35,24 @@ class NetworkConfig(BaseModel):
     agent_types: tuple[AgentType, ...] = (AgentType.VEHICLE,)
     """Types that are forecast."""
     neighbor_types: tuple[AgentType, ...] = (AgentType.VEHICLE, AgentType.PEDESTRIAN)
-    """Types that are looked at; empty: no neighbours."""
+    """Types of neighbours that are seen; empty: no neighbours."""
     uses_map: bool = True
-    """Whether vehicles look at the map; pedestrians never do (Trajectron++ for nuScenes)."""
+    """Whether vehicles see the map; pedestrians never do (Trajectron++ for nuScenes)."""
     frame: Frame = Frame.GROUND
-    """Frame of features and forecasts; checkpoints that do not say have the ground frame."""
+    """Frame of features and forecasts; checkpoints without this field use the ground frame."""
     far_map: bool = False
-    """Whether vehicles also look at a map patch that reaches as far as 6 s (agent frame only)."""
+    """Whether vehicles also see a map patch that reaches as far as 6 s (agent frame only)."""
     min_sigma_m: tuple[NonNegativeFloat, NonNegativeFloat] = (0.1, 0.3)
-    """m, standard deviation that no direction of a forecast goes below, at 1 s and at 6 s, linear between
+    """m, minimum standard deviation of a forecast in any direction, at 1 s and at 6 s, linear in between
     (agent frame only)."""
     modes: int = Field(default=25, ge=1, le=255)
     """K, categories of the latent variable."""
     blind: BlindContext = BlindContext.NONE
     max_control_sigma: float | None = Field(default=None, gt=0)
-    """Bound of the controls' standard deviations in prediction, rad/s and m/s² (pedestrians: m/s), before
-    calibration, which scales it with them. Training has none: there a mode may become kilometres wide and
-    stand for whatever the others do not explain, so that these need not. None: no bound, as published."""
+    """Maximum standard deviation of the controls in prediction, rad/s and m/s² (pedestrians: m/s), before
+    calibration, which scales it along with them. It does not apply in training: there a mode may become
+    kilometres wide and account for outliers, so that the other modes need not. None: no bound, as
+    published."""
 
     @model_validator(mode="after")
     def _types_have_states(self) -> "NetworkConfig":
@@ -84,13 +85,13 @@ class NetworkConfig(BaseModel):
         return self.features.looks_at_map(agent_type)
 
     def encoding_size(self, agent_type: AgentType) -> int:
-        """Length of the context encoding x."""
+        """Return the length of the context encoding x."""
         parts = 1 + bool(self.neighbor_types) + self.looks_at_map(agent_type)
         return HIDDEN * parts
 
     @property
     def supports_blind(self) -> bool:
-        """Whether it can forecast from an agent's own history alone."""
+        """Whether the network can forecast from an agent's own history alone."""
         return self.blind is not BlindContext.NONE
 
 
@@ -102,16 +103,16 @@ class CoverNetConfig(BaseModel):
     kind: Literal["covernet"] = "covernet"
     agent_types: tuple[Literal[AgentType.VEHICLE]] = (AgentType.VEHICLE,)
     neighbor_types: tuple[AgentType, ...] = (AgentType.VEHICLE, AgentType.PEDESTRIAN)
-    """Types that are drawn around the agent; empty: none."""
+    """Types that are drawn into the picture around the agent; empty: none."""
     uses_map: bool = True
     epsilon: float = Field(default=2.0, gt=0)
-    """ε, m: how near each training trajectory has a member of the set, at every step."""
+    """ε, m: maximum distance of each training trajectory from its nearest member of the set, at any step."""
     steps: int = Field(default=12, ge=1, le=120)
-    """T of the members, steps of 0.5 s."""
+    """T, steps of 0.5 s of the members."""
     members: int = Field(default=0, ge=0, le=100_000)
-    """M, of the set; 0: not known yet, it is made when training begins."""
+    """M, size of the trajectory set; 0: unknown, because the set is made when training begins."""
     modes: int = Field(default=25, ge=1, le=255)
-    """The likeliest members, which a forecast consists of."""
+    """K, number of members in a forecast: the most likely ones."""
 
     @model_validator(mode="after")
     def _makes_sense(self) -> "CoverNetConfig":
@@ -135,7 +136,7 @@ class CoverNetConfig(BaseModel):
 
     @property
     def supports_blind(self) -> bool:
-        """Whether it can forecast from an agent's own history alone."""
+        """Whether the network can forecast from an agent's own history alone."""
         return False
 
 
@@ -150,4 +151,4 @@ AnyNetworkConfig: TypeAlias = Annotated[
         _kind, custom_error_type="network_kind", custom_error_message="kind must be cvae or covernet"
     ),
 ]
-"""Of any network; ``kind`` tells them apart, and is a CVAE's where it is not given."""
+"""The configuration of any network. ``kind`` distinguishes them; configurations without it are of a CVAE."""

@@ -24,26 +24,27 @@ _VELOCITY, _ACCELERATION, _RATE = slice(2, 4), slice(4, 6), 7
 class CoverNet(nn.Module):
     """The fixed-set classifier of Phan-Minh et al. 2020 (section 3), with a small backbone.
 
-    It sees a picture of the scene in the agent's frame, which is the map patch and a layer with the other
-    agents as boxes at their places now, and the agent's speed, acceleration along its heading and heading
-    rate. Vehicles and pedestrians share the layer and differ by their size, so that a network that was
-    trained on data without pedestrians takes one for something small, not for nothing or anything.
+    Inputs are a picture of the scene in the agent's frame (the map patch, and a layer with the other agents
+    as boxes at their places now) and the agent's speed, acceleration along its heading and heading rate.
+    Vehicles and pedestrians share the layer and differ in size. So a network that was trained on data
+    without pedestrians sees a pedestrian as a small object instead of an input it does not know.
 
-    Its logits are over all M members of the set; a forecast is the likeliest K of them, laid where the agent
-    is, with the spread that the training trajectories have about their nearest members, calibrated after
-    training.
+    The logits are over all M members of the trajectory set. A forecast consists of the K most likely
+    members, placed at the agent, with the spread of the training trajectories about their nearest members,
+    calibrated after training.
 
     Args:
-        config: its shape, ``members`` known.
+        config: configuration with ``members`` > 0.
 
     Raises:
-        ValueError: ``members`` is not known.
+        ValueError: ``members`` is 0.
     """
 
     cover: Tensor
     """The buffer of ``trajectory_set``, under the name that it has in checkpoints."""
     variance: Tensor
-    """[T, 2], m², of the truth about its member, ahead and to the left; after calibration, of a forecast."""
+    """[T, 2], m², ahead and to the left: variance of the truth about its nearest member; after calibration,
+    variance of a forecast."""
 
     def __init__(self, config: CoverNetConfig) -> None:
         super().__init__()
@@ -65,7 +66,7 @@ class CoverNet(nn.Module):
         return self.cover
 
     def scores(self, features: Features) -> Tensor:
-        """Logits of all members: [N, M]."""
+        """Return the logits of all members: [N, M]."""
         layers = [features["map"]] if self.config.uses_map else []
         if self.config.neighbor_types:
             layers.append(rasterize_boxes(features["neighbor_boxes"])[:, None])
@@ -76,7 +77,7 @@ class CoverNet(nn.Module):
         return logits
 
     def forward(self, features: Features, context: Context, steps: int) -> tuple[Tensor, Positions]:
-        """Log-probabilities of the K likeliest members among themselves [N, K], and their positions.
+        """Return normalised log-probabilities of the K most likely members [N, K], and their positions.
 
         Raises:
             ValueError: the context is blind, or there are more steps than the members have.
@@ -95,13 +96,13 @@ class CoverNet(nn.Module):
 
 
 def present_heading(features: Features) -> Tensor:
-    """Of vehicles, now: [N] rad."""
+    """Return the headings of vehicles now: [N] rad."""
     heading: Tensor = features["history"][:, -1, HEADING] * _SCALE[HEADING]
     return heading
 
 
 def turned(vectors: Tensor, angle: Tensor) -> Tensor:
-    """Vectors [N, …, 2] turned counter-clockwise by angles [N], rad."""
+    """Rotate vectors [N, …, 2] counter-clockwise by angles [N], rad."""
     shape = (-1, *[1] * (vectors.dim() - 2))
     cos, sin = torch.cos(angle).view(shape), torch.sin(angle).view(shape)
     x, y = vectors.unbind(dim=-1)
@@ -109,7 +110,7 @@ def turned(vectors: Tensor, angle: Tensor) -> Tensor:
 
 
 def _kinematics(features: Features) -> Tensor:
-    """[N, 3]: speed, acceleration along the heading, heading rate, standardised."""
+    """Return speed, acceleration along the heading and heading rate, standardised: [N, 3]."""
     now = features["history"][:, -1]
     heading = present_heading(features)
     ahead = torch.stack([torch.cos(heading), torch.sin(heading)], dim=1)

@@ -16,7 +16,7 @@ PRIOR_DROPOUT = 0.1
 
 
 class Branch(nn.Module):
-    """What follows an encoding: prior, posterior, decoder and, for a vehicle, the heading's correction."""
+    """The layers after an encoding: prior, posterior, decoder and, for a vehicle, heading correction."""
 
     def __init__(
         self, config: NetworkConfig, encoding_size: int, state_size: int, corrects_heading: bool
@@ -34,7 +34,7 @@ class AgentNetwork(nn.Module):
     """The network of one agent type.
 
     Trajectron++ (Salzmann et al. 2020) and, with a blind context, CAB, Reweight and RUBiZ (Ben-Younes et
-    al. 2022, section 3). The reference is one network a method; here the method is in the objective.
+    al. 2022, section 3). The reference has one network per method; here only the objectives differ.
     """
 
     def __init__(self, config: NetworkConfig, agent_type: AgentType) -> None:
@@ -51,16 +51,16 @@ class AgentNetwork(nn.Module):
         )
         self.map_encoder = MapEncoder() if config.looks_at_map(agent_type) else None
         self.future_encoder = FutureEncoder(state_size)
-        self.prior_logits = nn.Linear(HIDDEN, config.modes)  # of both branches, as released
+        self.prior_logits = nn.Linear(HIDDEN, config.modes)  # shared by both branches, as released
         self.full = Branch(config, config.encoding_size(agent_type), state_size, vehicle)
         own = config.blind is BlindContext.OWN
         self.blind = Branch(config, HIDDEN, state_size, vehicle) if own else None
 
     def branch(self, context: Context) -> Branch:
-        """The branch that forecasts in that context.
+        """Return the branch that forecasts in that context.
 
         Raises:
-            ValueError: blind, and the network has no blind forecast.
+            ValueError: the context is blind, and the network has no blind forecast.
         """
         if context is Context.FULL or self.config.blind is BlindContext.NULL:
             return self.full
@@ -69,7 +69,7 @@ class AgentNetwork(nn.Module):
         return self.blind
 
     def encode(self, features: Features, context: Context) -> Tensor:
-        """The encoding x of what the agent may see: [N, X]."""
+        """Return the encoding x of the features: [N, X]."""
         history, first = features["history"], features["first"]
         own: Tensor = self.history_encoder(history, first)
         if context is Context.BLIND and self.config.blind is BlindContext.OWN:
@@ -90,17 +90,17 @@ class AgentNetwork(nn.Module):
         return torch.cat(parts, dim=1)
 
     def prior(self, encoding: Tensor, context: Context) -> Tensor:
-        """Mean-centred logits of p(z | x): [N, K]."""
+        """Return mean-centred logits of p(z | x): [N, K]."""
         branch = self.branch(context)
         hidden = branch.prior_dropout(F.relu(branch.prior_hidden(encoding)))
         return _centred(self.prior_logits(hidden))
 
     def posterior(self, encoding: Tensor, features: Features, future: Tensor, context: Context) -> Tensor:
-        """Mean-centred logits of q(z | x, y): [N, K].
+        """Return mean-centred logits of q(z | x, y): [N, K].
 
         Args:
             encoding: [N, X], of the same context.
-            features: of the agents.
+            features: the agents' features.
             future: [N, T, 2], positions relative to now, standardised.
             context: full or blind.
         """
@@ -115,32 +115,32 @@ class AgentNetwork(nn.Module):
         steps: int,
         sample_controls: bool = False,
     ) -> Positions:
-        """Positions of every mode, relative to now: means [N, K, T, 2], covariances [N, K, T, 2, 2].
+        """Return positions of every mode, relative to now: means [N, K, T, 2], covariances [N, K, T, 2, 2].
 
         Args:
             encoding: [N, X], of the same context.
-            features: of the agents.
+            features: the agents' features.
             context: full or blind.
             steps: T.
-            sample_controls: feed back samples of the controls instead of their means (training).
+            sample_controls: whether to feed back samples of the controls instead of their means (training).
         """
         branch = self.branch(context)
         controls = branch.decoder(encoding, features["history"][:, -1], steps, sample_controls)
         return self._integrate(branch, controls, encoding, features)
 
     def sample(self, encoding: Tensor, features: Features, latents: Tensor) -> Tensor:
-        """One trajectory an agent of the full context, its controls drawn; differentiable.
+        """Sample one trajectory per agent in the full context, differentiably.
 
         Args:
             encoding: [N, X], of the full context.
-            features: of the agents.
+            features: the agents' features.
             latents: [N, T] int64, the category at each step.
 
         Returns:
             [N, T, 2], m, relative to now.
         """
         controls = self.full.decoder.sample(encoding, features["history"][:, -1], latents)
-        one, another = controls[:, None].unbind(dim=-1)  # one "mode" an agent
+        one, another = controls[:, None].unbind(dim=-1)  # one "mode" per agent
         none = torch.zeros_like(one)
         drawn = Controls(one, another, none, none, none)
         return self._integrate(self.full, drawn, encoding, features).mean[:, 0]
@@ -148,7 +148,7 @@ class AgentNetwork(nn.Module):
     def _integrate(
         self, branch: Branch, controls: Controls, encoding: Tensor, features: Features
     ) -> Positions:
-        """Positions out of controls [N, M, T]."""
+        """Integrate controls [N, M, T] into positions."""
         if branch.heading_correction is None:
             return integrate_velocity(controls)
         velocity = features["velocity"]
@@ -159,7 +159,7 @@ class AgentNetwork(nn.Module):
         return integrate_unicycle(controls, heading.expand(modes), speed.expand(modes))
 
     def forward(self, features: Features, context: Context, steps: int) -> tuple[Tensor, Positions]:
-        """Log-probabilities of the modes [N, K], and their positions."""
+        """Return log-probabilities of the modes [N, K], and their positions."""
         encoding = self.encode(features, context)
         log_weights = F.log_softmax(self.prior(encoding, context), dim=-1)
         return log_weights, self.decode(encoding, features, context, steps)

@@ -1,9 +1,9 @@
 """Dynamics that turn control distributions into position distributions.
 
 Trajectron++, section 4.2: means go through the dynamics, covariances through its Jacobians (as in an
-extended Kalman filter). Every state but the position is a running sum of controls, and the position a
-running sum of increments that depend on those; so all steps are computed at once, not one by one. The
-2 × 2 algebra is written out: products of tiny matrices are slow, sums and products of whole tensors fast.
+extended Kalman filter). Every state except the position is a running sum of controls, and the position is a
+running sum of increments that depend on those states. So all steps are computed at once. The 2 × 2 algebra is
+written out, because products of tiny matrices are slow while operations on whole tensors are fast.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from torch import Tensor
 from model.scenes.scene import STEP_SECONDS
 
 STRAIGHT_BELOW = 0.01
-"""rad/s; slower turning is no turning: the heading stays and its uncertainty does not grow, as in the
+"""rad/s; a slower turn counts as none: the heading stays and its uncertainty does not grow, as in the
 released Trajectron++, whose weights are trained with it."""
 
 
@@ -40,14 +40,14 @@ class Positions(NamedTuple):
 
 
 def integrate_velocity(controls: Controls) -> Positions:
-    """Single integrator (pedestrians): velocities → positions."""
+    """Integrate velocities into positions (single integrator, for pedestrians)."""
     dt = STEP_SECONDS
     x, y, xx, xy, yy = _running_sums(torch.stack(controls), inclusive=True)
     return _positions(dt * x, dt * y, dt**2 * xx, dt**2 * xy, dt**2 * yy)
 
 
 def integrate_unicycle(controls: Controls, heading: Tensor, speed: Tensor) -> Positions:
-    """Unicycle (vehicles): heading rates and accelerations → positions.
+    """Integrate heading rates and accelerations into positions (unicycle, for vehicles).
 
     Args:
         controls: heading rate and acceleration, [..., T].
@@ -80,7 +80,7 @@ def integrate_unicycle(controls: Controls, heading: Tensor, speed: Tensor) -> Po
     bu = (s.x_w * ww + s.x_a * wa, s.x_w * wa + s.x_a * aa, s.y_w * ww + s.y_a * wa, s.y_w * wa + s.y_a * aa)
     increments = torch.stack([one + dt * two for one, two in zip(aq, bu, strict=True)])
     pq = _running_sums(increments, inclusive=False)
-    # Σpq Aᵀ + half of A Σqq Aᵀ counts twice, once transposed
+    # Σpq Aᵀ + half of A Σqq Aᵀ is added together with its transpose
     m_xh, m_xv, m_yh, m_yv = (one + 0.5 * two for one, two in zip(pq, aq, strict=True))
     xx = 2 * (m_xh * x_h + m_xv * s.x_v) + bu[0] * s.x_w + bu[1] * s.x_a
     yy = 2 * (m_yh * y_h + m_yv * s.y_v) + bu[2] * s.y_w + bu[3] * s.y_a
@@ -89,9 +89,9 @@ def integrate_unicycle(controls: Controls, heading: Tensor, speed: Tensor) -> Po
 
 
 def _running_sums(values: Tensor, inclusive: bool) -> Tensor:
-    """Sums over the last axis up to each step, or up to the one before: a product with a triangle.
+    """Sum over the last axis up to each step (inclusive) or up to the step before.
 
-    torch.cumsum takes several times as long on rows as short as these.
+    A product with a triangular matrix: torch.cumsum is several times slower on rows as short as these.
     """
     steps = values.shape[-1]
     triangle = torch.ones(steps, steps, dtype=values.dtype, device=values.device)
@@ -117,7 +117,7 @@ class _UnicycleStep(NamedTuple):
 
 
 def _unicycle_step(phi: Tensor, v: Tensor, w: Tensor, a: Tensor) -> _UnicycleStep:
-    """The exact integral of (v + at)·(cos, sin)(φ + wt) over one step, and its derivatives."""
+    """Return the exact integral of (v + at)·(cos, sin)(φ + wt) over one step, and its derivatives."""
     dt = STEP_SECONDS
     cos, sin = phi.cos(), phi.sin()
     c0, c1, c2, s0, s1, s2 = _moments(w * dt)
@@ -136,10 +136,10 @@ def _unicycle_step(phi: Tensor, v: Tensor, w: Tensor, a: Tensor) -> _UnicycleSte
 
 
 def _moments(theta: Tensor) -> tuple[Tensor, ...]:
-    """∫₀¹ uⁿ cos(θu) du for n = 0, 1, 2, then ∫₀¹ uⁿ sin(θu) du likewise.
+    """Return ∫₀¹ uⁿ cos(θu) du for n = 0, 1, 2, then ∫₀¹ uⁿ sin(θu) du likewise.
 
-    By their power series for small angles: the closed forms divide by θ³, and in float32 their rounding
-    would make covariances wrong by tens of percent at the slow turns that are most of driving.
+    Small angles use the power series: the closed forms divide by θ³, and their rounding in float32 would
+    make covariances wrong by tens of percent in slow turns, which are most of driving.
     """
     small = theta.abs() < 1
     near = torch.where(small, theta, 0.0)
@@ -157,13 +157,13 @@ def _moments(theta: Tensor) -> tuple[Tensor, ...]:
     return tuple(torch.where(small, x, y) for x, y in zip(series, closed, strict=True))
 
 
-_TERMS = range(6)  # the first left out is below 2e-10 for |θ| < 1
+_TERMS = range(6)  # the first omitted term is below 2e-10 for |θ| < 1
 _COSINE_SERIES = [[(-1) ** k / (factorial(2 * k) * (2 * k + n + 1)) for k in _TERMS] for n in range(3)]
 _SINE_SERIES = [[(-1) ** k / (factorial(2 * k + 1) * (2 * k + n + 2)) for k in _TERMS] for n in range(3)]
 
 
 def _polynomial(x: Tensor, coefficients: Sequence[float]) -> Tensor:
-    """Σ coefficients[k] · xᵏ."""
+    """Return Σ coefficients[k] · xᵏ."""
     result = torch.full_like(x, coefficients[-1])
     for coefficient in reversed(coefficients[:-1]):
         result = result * x + coefficient

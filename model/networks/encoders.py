@@ -1,4 +1,4 @@
-"""What becomes of history, neighbours, map and (in training) the future."""
+"""Encoders of history, neighbours, map and, in training, the future."""
 
 from collections.abc import Mapping, Sequence
 from typing import TypeAlias
@@ -15,7 +15,7 @@ RNN_DROPOUT = 0.25
 MAP_DROPOUT = 0.5
 
 ConvShape: TypeAlias = tuple[int, int, int, int]
-"""Channels in, channels out, kernel, stride."""
+"""Input channels, output channels, kernel size, stride."""
 MAP_LAYERS: tuple[ConvShape, ...] = ((3, 10, 5, 2), (10, 20, 5, 2), (20, 10, 5, 1), (10, 1, 3, 1))
 
 
@@ -32,7 +32,7 @@ class HistoryEncoder(HistoryLSTM):
 
 
 class NeighborEncoder(nn.Module):
-    """The neighbours' influence: an LSTM an edge type, attention over the types.
+    """The neighbours' influence: one LSTM per edge type, attention over the types.
 
     Trajectron++, section 4.1: neighbours of one type are summed, encoded together with the own history,
     and the types' encodings are combined by additive attention (Bahdanau et al. 2015) with the own
@@ -58,7 +58,7 @@ class NeighborEncoder(nn.Module):
         edge_mask: Tensor,
         query: Tensor,
     ) -> Tensor:
-        """Influence of all neighbours.
+        """Return the influence of all neighbours.
 
         Args:
             neighbors: by type, [N, F, D_type], summed standardised histories.
@@ -81,12 +81,12 @@ class NeighborEncoder(nn.Module):
 
 
 class MapEncoder(nn.Module):
-    """Convolutions over the map patch: [N, 3, 100, 100] in [-1, 1] → [N, 32], unless told otherwise.
+    """Convolutions over the map patch: by default [N, 3, 100, 100] in [-1, 1] → [N, 32].
 
     Args:
-        shapes: of each layer: channels in and out, kernel, stride.
-        pixels: that the last layer leaves, over all its channels.
-        size: of the encoding.
+        shapes: shape of each layer.
+        pixels: number of outputs of the last layer, over all its channels.
+        size: length of the encoding.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class MapEncoder(nn.Module):
         self.project = nn.Linear(pixels, size)
         self.dropout = nn.Dropout(MAP_DROPOUT)
         self.training_dtype = torch.float32
-        """Of the convolutions in training."""
+        """Type of the convolutions in training."""
 
     def forward(self, patches: Tensor) -> Tensor:
         low = self.training and self.training_dtype is not torch.float32
@@ -108,7 +108,7 @@ class MapEncoder(nn.Module):
         return encoded
 
     def null(self, agents: int) -> Tensor:
-        """The encoding of an unknown map, midway between absent and present: [agents, 32]."""
+        """Return the encoding of an unknown map, midway between absent and present: [agents, 32]."""
         blank = self.project.weight.new_zeros(1, 3, 100, 100)
         for conv in self.convs:
             blank = F.leaky_relu(conv(blank), 0.2)
@@ -127,7 +127,7 @@ class FutureEncoder(nn.Module):
         self.dropout = nn.Dropout(RNN_DROPOUT)
 
     def forward(self, future: Tensor, state_now: Tensor) -> Tensor:
-        """Encoding of the future.
+        """Return the encoding of the future.
 
         Args:
             future: [N, T, 2], positions relative to now, standardised.
@@ -137,7 +137,7 @@ class FutureEncoder(nn.Module):
             [N, 128]: last hidden, then last cell state, each forward and backward.
         """
         hidden, cell = self.initial_h(state_now), self.initial_c(state_now)
-        # Only the forward direction starts from the present state
+        # Only the forward direction starts from the state now
         start = (
             torch.stack([hidden, torch.zeros_like(hidden)]),
             torch.stack([cell, torch.zeros_like(cell)]),

@@ -1,4 +1,4 @@
-"""What forecasters around trained networks share."""
+"""Forecasters around trained networks: CVAEs and CoverNet."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -27,14 +27,14 @@ Network = TypeVar("Network", bound=nn.Module)
 
 
 class Networks(nn.ModuleDict, Generic[Network]):
-    """One network an agent type, by its name: the parameters of a checkpoint.
+    """One network per agent type, by the type's name: the parameters of a checkpoint.
 
-    Each takes features, a context and the steps T, and gives log-probabilities of its modes [N, K] and
-    their ``Positions``, relative to now.
+    Each takes features, a context and the number of steps T, and returns log-probabilities of its modes
+    [N, K] and their ``Positions``, relative to now.
 
     Args:
-        config: their shape.
-        networks: by type.
+        config: configuration of the networks.
+        networks: networks by type.
     """
 
     def __init__(self, config: AnyNetworkConfig, networks: Mapping[AgentType, Network]) -> None:
@@ -42,7 +42,7 @@ class Networks(nn.ModuleDict, Generic[Network]):
         self.config = config
 
     def of(self, agent_type: AgentType) -> Network:
-        """The network of that type."""
+        """Return the network of that type."""
         network: Any = self[agent_type.value]
         made: Network = network
         return made
@@ -55,9 +55,9 @@ class NetworkForecaster(Forecaster, Generic[SomeNetworks]):
     """A forecaster around networks and their trained parameters.
 
     Args:
-        info: what is known of the model.
-        make: makes the networks.
-        tensors: their parameters by name.
+        info: facts about the model.
+        make: builder of the networks.
+        tensors: parameters of the networks by name.
 
     Raises:
         ValueError: the tensors are not those of such networks, naming them.
@@ -67,7 +67,7 @@ class NetworkForecaster(Forecaster, Generic[SomeNetworks]):
         self, info: ModelInfo, make: Callable[[], SomeNetworks], tensors: Mapping[str, Tensor]
     ) -> None:
         self.info = info
-        with torch.device("meta"):  # nothing is drawn that the tensors replace
+        with torch.device("meta"):  # skips the initialisation, since the tensors replace all parameters
             self.networks = make()
         self.config = self.networks.config
         _check(dict(self.networks.state_dict()), tensors)
@@ -75,15 +75,15 @@ class NetworkForecaster(Forecaster, Generic[SomeNetworks]):
         self.networks.eval().requires_grad_(False)
 
     def requires_heading(self, agent_type: AgentType) -> bool:
-        """Vehicles only: a pedestrian's state has no heading, and it sees no map."""
+        """Return True for vehicles: a pedestrian's state has no heading, and it sees no map."""
         return agent_type is AgentType.VEHICLE
 
     def looks_at_map(self, agent_type: AgentType) -> bool:
-        """Vehicles only, if at all."""
+        """Return whether agents of that type see the map; only vehicles can."""
         return self.config.looks_at_map(agent_type)
 
     def looks_at_far_map(self, agent_type: AgentType) -> bool:
-        """Vehicles only, in the agent's frame."""
+        """Return whether agents of that type see the far map; only vehicles in the agent's frame can."""
         return (
             self.looks_at_map(agent_type) and isinstance(self.config, NetworkConfig) and self.config.far_map
         )
@@ -146,7 +146,7 @@ def _check(expected: Mapping[str, Tensor], given: Mapping[str, Tensor]) -> None:
 
 
 class CvaeNetworks(Networks[AgentNetwork | AgentFrameNetwork]):
-    """The networks of a CVAE."""
+    """The networks of a CVAE, one per agent type."""
 
     def __init__(self, config: NetworkConfig) -> None:
         if config.frame is Frame.AGENT:
@@ -162,9 +162,9 @@ class CvaeForecaster(NetworkForecaster[CvaeNetworks]):
     """CAB, Trajectron++, Reweight, RUBiZ or HalentNet, depending on the weights.
 
     Args:
-        info: what is known of the model.
-        config: the networks' shape.
-        tensors: their parameters by name.
+        info: facts about the model.
+        config: configuration of the networks.
+        tensors: parameters of the networks by name.
 
     Raises:
         ValueError: the tensors are not those of such networks, naming them.
@@ -175,19 +175,19 @@ class CvaeForecaster(NetworkForecaster[CvaeNetworks]):
 
 
 class CoverNetworks(Networks[CoverNet]):
-    """The networks of CoverNet: one, for vehicles."""
+    """The networks of CoverNet: a single one, for vehicles."""
 
     def __init__(self, config: CoverNetConfig) -> None:
         super().__init__(config, {kind: CoverNet(config) for kind in config.agent_types})
 
 
 class CoverNetForecaster(NetworkForecaster[CoverNetworks]):
-    """CoverNet: the likeliest members of a fixed set of trajectories.
+    """CoverNet: the most likely members of a fixed set of trajectories.
 
     Args:
-        info: what is known of the model.
-        config: the network's shape.
-        tensors: its parameters and its set of trajectories by name.
+        info: facts about the model.
+        config: configuration of the network.
+        tensors: parameters and trajectory set of the network by name.
 
     Raises:
         ValueError: the tensors are not those of such a network, naming them.

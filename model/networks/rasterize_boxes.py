@@ -1,4 +1,4 @@
-"""Draws the agents around into the picture that the map patch is."""
+"""Drawing of neighbours, as boxes, into a layer in the geometry of the map patch."""
 
 import math
 
@@ -9,19 +9,19 @@ from model.features.neighbor_boxes import BOX_REACH
 from model.scenes.raster import COLUMNS_RIGHT, PATCH_PIXELS_PER_METER, PATCH_SIZE, ROWS_BEHIND
 
 _RADIUS = math.floor(BOX_REACH * PATCH_PIXELS_PER_METER + math.sqrt(0.5))
-"""Pixels from the one that a box's middle lies in: none farther away than that, or one more upwards, is
-touched by the box and its soft edge."""
+"""Pixels; a box and its soft edge reach at most that far below the pixel of the box's middle, and one pixel
+more above it."""
 
 
 def rasterize_boxes(boxes: Tensor) -> Tensor:
-    """A picture of boxes in the geometry of the map patch (``model.scenes.raster``): rows ahead, columns
-    left.
+    """Draw boxes into a layer in the geometry of the map patch (``model.scenes.raster``): rows ahead,
+    columns left.
 
-    A pixel is as much covered as each side of the box, had it no other, would cover of it: edges are soft
-    over one pixel, so that a box moves smoothly. Only the pixels around each box are looked at.
+    The coverage of a pixel is the product of its coverages along and across the box. So edges are soft over
+    one pixel, and a moving box changes the picture smoothly. Only pixels near a box are computed.
 
     Args:
-        boxes: [N, S, 5], as ``model.features.neighbor_boxes`` makes them; what has no length is not drawn.
+        boxes: [N, S, 5], from ``model.features.neighbor_boxes``; boxes of length 0 are padding.
 
     Returns:
         [N, 100, 100] float32 from −1 (free) to 1 (covered).
@@ -32,7 +32,7 @@ def rasterize_boxes(boxes: Tensor) -> Tensor:
     middle = start + PATCH_PIXELS_PER_METER * place
     base = middle.floor()
     around = torch.arange(-_RADIUS, _RADIUS + 2, dtype=place.dtype, device=place.device)
-    rows = around - (middle - base)[:, :1]  # [m, W], from the middle
+    rows = around - (middle - base)[:, :1]  # [m, W], relative to the middle
     columns = around - (middle - base)[:, 1:]
     cos, sin = torch.cos(turn)[..., None], torch.sin(turn)[..., None]
     along = rows[:, :, None] * cos + columns[:, None, :] * sin  # [m, W, W]
@@ -40,7 +40,7 @@ def rasterize_boxes(boxes: Tensor) -> Tensor:
     half = 0.5 * PATCH_PIXELS_PER_METER * size[..., None, None]
     covered = _share(along, half[:, 0]) * _share(across, half[:, 1])
 
-    # A border takes what lies outside
+    # Pixels outside the patch fall on a border, which is cut off
     border = PATCH_SIZE + 2
     row, column = ((base[:, axis, None] + around + 1).clamp(0, border - 1).to(torch.int64) for axis in (0, 1))
     index = (agent[:, None] * border + row)[:, :, None] * border + column[:, None, :]
@@ -51,5 +51,5 @@ def rasterize_boxes(boxes: Tensor) -> Tensor:
 
 
 def _share(offset: Tensor, half: Tensor) -> Tensor:
-    """How much of a pixel at that offset an interval of ±half covers, pixels."""
+    """Return the share of a pixel at an offset that an interval of ±half covers; all in pixels."""
     return torch.minimum((half + 0.5 - offset.abs()).clamp_min(0.0), (2 * half).clamp_max(1.0))

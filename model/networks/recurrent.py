@@ -1,4 +1,4 @@
-"""Recurrent cells whose inputs begin at different frames."""
+"""The recurrent cells: an LSTM over histories of different lengths, and a fast GRU cell."""
 
 import math
 
@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 
 class HistoryLSTM(nn.Module):
-    """An LSTM over right-aligned histories: state stays zero until an agent's first observed frame."""
+    """An LSTM over right-aligned histories: the state stays zero until an agent's first observed frame."""
 
     def __init__(self, input_size: int, hidden_size: int) -> None:
         super().__init__()
@@ -24,11 +24,11 @@ class HistoryLSTM(nn.Module):
         self.bias_hh = parameter(4 * hidden_size)
 
     def forward(self, inputs: Tensor, first: Tensor) -> Tensor:
-        """The hidden state after the last frame.
+        """Return the hidden state after the last frame.
 
         Args:
             inputs: [N, F, D].
-            first: [N] int64, the first frame that counts.
+            first: [N] int64, the first observed frame.
 
         Returns:
             [N, hidden_size].
@@ -37,7 +37,7 @@ class HistoryLSTM(nn.Module):
         hidden = inputs.new_zeros(inputs.shape[0], self.hidden_size)
         cell = hidden
         started = torch.arange(inputs.shape[1], device=inputs.device)[:, None] >= first  # [F, N]
-        if torch.compiler.is_exporting():  # a graph cannot hang on values; the result is the same
+        if torch.compiler.is_exporting():  # an exported graph cannot depend on values; the result is the same
             everywhere = [False] * inputs.shape[1]
         else:
             everywhere = started.all(dim=1).tolist()
@@ -56,10 +56,10 @@ class HistoryLSTM(nn.Module):
 
 
 class GRUCell(nn.Module):
-    """A GRU cell that takes what its input adds to the gates ready-made.
+    """A GRU cell that takes the contribution of its input to the gates instead of the input.
 
-    The decoder's input is constant over the steps but for two numbers; its product with the weights is
-    then computed once (REFERENCE: 42 MFLOP an agent instead of 70).
+    The decoder's input is constant over the steps except for two numbers, so that its product with the
+    weights is computed once (REFERENCE: 42 MFLOP per agent instead of 70).
     """
 
     def __init__(self, input_size: int, hidden_size: int) -> None:
@@ -76,18 +76,18 @@ class GRUCell(nn.Module):
         self.bias_hh = parameter(3 * hidden_size)
 
     def forward(self, reset_update_in: Tensor, new_in: Tensor, hidden: Tensor) -> Tensor:
-        """The next hidden state.
+        """Return the next hidden state.
 
         Args:
-            reset_update_in: [N, 2·hidden_size], what the input adds to these gates, both biases included;
-                overwritten.
-            new_in: [N, hidden_size], what the input adds to the candidate, its bias included.
-            hidden: [N, hidden_size]; all three of one dtype, which the weights are brought to.
+            reset_update_in: [N, 2·hidden_size], contribution of the input to these gates, both biases
+                included; overwritten.
+            new_in: [N, hidden_size], contribution of the input to the candidate, its bias included.
+            hidden: [N, hidden_size]; the weights are cast to the dtype that all three have.
         """
         size = self.hidden_size
         weight, bias = self.weight_hh.to(hidden.dtype), self.bias_hh.to(hidden.dtype)
         gates = reset_update_in.addmm_(hidden, weight[: 2 * size].T).sigmoid_()
         candidate = F.linear(hidden, weight[2 * size :], bias[2 * size :])
-        # tanh(x) = 2σ(2x) − 1: on CPUs the sigmoid takes a third of tanh's time
+        # tanh(x) = 2σ(2x) − 1: on CPUs the sigmoid takes a third of the time of tanh
         new = torch.sigmoid(2 * torch.addcmul(new_in, gates[:, :size], candidate)) * 2 - 1
         return torch.lerp(new, hidden, gates[:, size:])

@@ -1,1 +1,1 @@
-"""What was seen: observations, resampling to the grid, rasters and their patches."""
+"""Observed scenes: observations, their resampling to the grid, rasters and map patches."""

@@ -1,25 +1,25 @@
-"""Observations of agents as they come in: any rate, any length, with or without derivatives."""
+"""Observations of agents as received: any rate, any length, with or without derivatives."""
 
 from dataclasses import dataclass, fields
 
 from model.arrays import Bools, Floats, Ints
 
 MAX_SPEED = 100.0
-"""m/s; successive observations further apart than this allows are not of one agent."""
+"""m/s, maximum speed between successive observations of an agent."""
 JUMP_SLACK = 5.0
-"""m; beyond what the speed allows: detections jitter, and short intervals magnify it."""
+"""m, allowed in addition to ``MAX_SPEED``: detections jitter, and short intervals magnify that."""
 
 
 @dataclass(frozen=True)
 class Observations:
-    """Observations of N agents, at most S each, padded behind.
+    """Observations of N agents, at most S each, padded at the end.
 
-    Within an agent times ascend strictly. Everything is finite but for the padding and for what was not
-    given, which is NaN. SI units, ground frame, seconds since the epoch.
+    The times of an agent ascend strictly. Values are finite, except for the padding and for values that were
+    not given, which are NaN. SI units, ground frame, seconds since the epoch.
     """
 
     count: Ints
-    """[N], observations of each agent, at least 1."""
+    """[N], number of observations of each agent, at least 1."""
     time: Floats
     """[N, S], s; +inf in the padding."""
     position: Floats
@@ -34,5 +34,5 @@ class Observations:
     """[N, S], rad/s."""
 
     def select(self, agents: Bools | Ints) -> "Observations":
-        """Some of the agents, by mask [N] or indices [n]."""
+        """Return some of the agents, by mask [N] or indices [n]."""
         return Observations(**{field.name: getattr(self, field.name)[agents] for field in fields(self)})

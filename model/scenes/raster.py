@@ -20,7 +20,7 @@ from model.scenes.scene import Raster
 PATCH_SIZE = 100
 """Rows and columns of a patch."""
 PATCH_PIXELS_PER_METER = 3.0
-"""Resolution of a patch, whatever the raster's."""
+"""Resolution of a patch, independent of the raster's."""
 ROWS_BEHIND = 10
 """The agent's row: 10 rows (3.3 m) lie behind it, 90 (30 m) ahead."""
 COLUMNS_RIGHT = 50
@@ -29,7 +29,7 @@ COLUMNS_RIGHT = 50
 
 @dataclass(frozen=True)
 class PatchGeometry:
-    """Where the pixels of a square patch lie in its agent's frame: element (i, j) shows the point
+    """The geometry of a square patch in its agent's frame: element (i, j) shows the point
     (i − rows_behind, j − columns_right) / pixels_per_meter ahead and to the left of the agent."""
 
     size: int
@@ -48,7 +48,7 @@ NEAR = PatchGeometry(PATCH_SIZE, PATCH_PIXELS_PER_METER, ROWS_BEHIND, COLUMNS_RI
 """30 m ahead, 3.3 m behind, 16.7 m to each side."""
 FAR = PatchGeometry(PATCH_SIZE, 1.4, 14, 50)
 """61 m ahead, 10 m behind, 36 m to each side: no corner is farther than 74 m, where recorded rasters end
-(beyond it they would tell where nobody goes)."""
+(a patch that reached beyond that would reveal where no recorded agent goes)."""
 
 
 def cut_patches(
@@ -56,17 +56,18 @@ def cut_patches(
 ) -> Float32s:
     """Return map patches of N agents, bilinear between raster pixels.
 
-    A raster of twice the patch's resolution or more is first brought near it, so that thin lines stay. Its
-    pixels are joined as the raster counts them: a patch does not hang on whose else are cut with it.
+    A raster of twice the patch's resolution or more is first coarsened to near that resolution, so that thin
+    lines remain. The coarse pixels are aligned with the raster, so that a patch does not depend on the other
+    agents.
 
-    Positions are taken relative to the raster's origin in float64 and used to the fraction of a pixel.
+    Positions are subtracted from the raster's origin in float64, and fractions of a pixel count.
 
     Args:
         raster: the scene's map, any resolution.
         position: [N, 2], m, ground frame.
         heading: [N], rad.
-        geometry: where a patch's pixels lie.
-        outside: what pixels outside the raster are.
+        geometry: geometry of the patches.
+        outside: value of pixels outside the raster.
 
     Returns:
         [N, 3, S, S] in [0, 1].
@@ -79,26 +80,26 @@ def cut_patches(
         raise ValueError("a map patch needs a finite position and heading")
     layers, rows, columns = raster.layers.shape
     patches = np.full((count, layers, geometry.size, geometry.size), outside, dtype=np.float32)
-    # Raster pixels, from here on; (row, column) go with ground (x, y).
+    # In raster pixels from here on; (row, column) correspond to ground (x, y)
     center = (position - raster.origin) * raster.pixels_per_meter
     zoom = raster.pixels_per_meter / geometry.pixels_per_meter
     reach = geometry.reach * zoom + 1
     on_map = ((center > -reach) & (center < np.array([rows, columns]) - 1 + reach)).all(axis=1)
     if not (on_map.any() and raster.layers.size):
         return patches
-    # Only the part that the agents can see is turned into floats.
+    # Only the part that the agents can see is converted to floats
     low = np.maximum(np.floor(center[on_map].min(axis=0) - reach), 0).astype(np.int64)
     high = np.minimum(np.ceil(center[on_map].max(axis=0) + reach) + 1, [rows, columns]).astype(np.int64)
     factor = max(int(zoom), 1)
     low -= low % factor
     pixels = _coarsened(raster.layers[:, low[0] : high[0], low[1] : high[1]], factor)
-    if outside:  # one layer more, which tells how much of a sample lies on the raster
+    if outside:  # an additional layer: the share of a sample that lies on the raster
         pixels = np.concatenate([pixels, np.ones_like(pixels[:1])])
     crop = torch.from_numpy(pixels.astype(np.float32))
-    # Of coarser pixels, whose middle is that of those that they are made of
+    # In coarse pixels, each centred on the raster pixels that it consists of
     coarse = (center[on_map] - low - (factor - 1) / 2) / factor
     seen = functional.grid_sample(
-        crop.expand(int(on_map.sum()), -1, -1, -1),  # no copy: all agents read the same pixels
+        crop.expand(int(on_map.sum()), -1, -1, -1),  # no copy: all agents share the same pixels
         _grid(zoom / factor, coarse, heading[on_map], (crop.shape[1], crop.shape[2]), geometry),
         mode="bilinear",
         padding_mode="zeros",
@@ -113,16 +114,16 @@ def cut_patches(
 
 
 def _coarsened(layers: Bytes, factor: int) -> Bytes:
-    """The layers in pixels of ``factor`` × ``factor``, set where any of theirs is.
+    """Return the layers in coarse pixels of ``factor`` × ``factor``, each the maximum of its raster pixels.
 
-    Sampled as it is, a raster finer than the patch would lose lines that fall between the samples.
+    Samples of a finer raster would lose lines that fall between them.
     """
     if factor == 1:
         return layers
     count, rows, columns = layers.shape
     padded = np.zeros((count, -(-rows // factor) * factor, -(-columns // factor) * factor), dtype=np.uint8)
     padded[:, :rows, :columns] = layers
-    # By slices, as a maximum over two axes of a reshaped array takes ten times as long
+    # Slice by slice: a maximum over two axes of a reshaped array is ten times slower
     coarse = padded[:, ::factor, ::factor].copy()
     for row in range(factor):
         for column in range(factor):
@@ -133,18 +134,19 @@ def _coarsened(layers: Bytes, factor: int) -> Bytes:
 def _grid(
     scale: float, center: Floats, heading: Floats, shape: tuple[int, int], geometry: PatchGeometry
 ) -> Tensor:
-    """Return where each patch pixel lies, in the coordinates of ``grid_sample`` (column first, ∓1 half a
-    pixel outside the outermost pixels): [N, S, S, 2].
+    """Return the sampling point of each patch pixel in the coordinates of ``grid_sample``: [N, S, S, 2].
+
+    They have the column first, and ∓1 lies half a pixel outside the outermost pixels.
 
     Args:
-        scale: pixels of what is sampled to a pixel of the patch.
-        center: [N, 2], the agents, pixels.
+        scale: pixels of the sampled image per pixel of the patch.
+        center: [N, 2], positions of the agents, pixels.
         heading: [N], rad.
-        shape: rows and columns of what is sampled.
-        geometry: of the patch.
+        shape: rows and columns of the sampled image.
+        geometry: geometry of the patches.
     """
     cos, sin = scale * np.cos(heading), scale * np.sin(heading)
-    # pixel = center + i' (cos, sin) + j' (−sin, cos), with i' and j' counted from the agent's row, column.
+    # pixel = center + i' (cos, sin) + j' (−sin, cos), with i' and j' relative to the agent's row and column
     ahead, left = np.stack([sin, cos], axis=-1), np.stack([cos, -sin], axis=-1)  # [N, (column, row)]
     half = np.array([shape[1], shape[0]]) / 2
     start = _float32((center[:, ::-1] + 0.5) / half - 1)[:, None]

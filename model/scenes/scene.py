@@ -1,4 +1,4 @@
-"""What a forecaster sees: agents' states on the 0.5 s grid, and the map."""
+"""The input of forecasters: agents' states on the 0.5 s grid, and the map."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -13,7 +13,7 @@ STEP_SECONDS = 0.5
 
 
 class AgentType(StrEnum):
-    """Kinds of road users."""
+    """Types of road users."""
 
     VEHICLE = "vehicle"
     PEDESTRIAN = "pedestrian"
@@ -23,10 +23,10 @@ class AgentType(StrEnum):
 
 @dataclass(frozen=True)
 class AgentStates:
-    """States of N agents on the grid time − k · 0.5 s, F frames, oldest first; the last one is now.
+    """States of N agents on the grid time − k · 0.5 s, F frames, oldest first; the last frame is now.
 
-    Frames before ``first`` are NaN. SI units, ground frame, float64: relative positions are formed by
-    subtraction before anything becomes float32.
+    Frames before ``first`` are NaN. SI units, ground frame, float64: relative positions are computed before
+    anything is converted to float32.
     """
 
     position: Floats
@@ -36,26 +36,26 @@ class AgentStates:
     acceleration: Floats
     """[N, F, 2], m/s²."""
     heading: Floats
-    """[N, F], rad in [-π, π); NaN where neither given nor to be told from motion."""
+    """[N, F], rad in [-π, π); NaN where neither given nor known from motion."""
     heading_rate: Floats
     """[N, F], rad/s."""
     first: Ints
-    """[N], the first frame from which on the agent was observed without a break; F: not observed now."""
+    """[N], first frame of the unbroken run of observations that ends now; F: not observed now."""
     velocity_known: Bools
-    """[N], whether the velocity now was given or could be derived; where not, it is zero."""
+    """[N], whether the velocity now was given or could be derived; otherwise it is zero."""
 
     @property
     def frames(self) -> int:
-        """F."""
+        """F, number of frames."""
         return int(self.position.shape[1])
 
     @property
     def observed(self) -> Bools:
-        """[N, F], whether the frame is there."""
+        """[N, F], whether the agent was observed in the frame."""
         return np.arange(self.frames)[None, :] >= self.first[:, None]
 
     def last_frames(self, frames: int) -> "AgentStates":
-        """The newest ``frames`` frames only (all of them where there are fewer)."""
+        """Return the newest ``frames`` frames, or all of them if there are fewer."""
         cut = max(self.frames - frames, 0)
         return replace(
             self,
@@ -68,13 +68,13 @@ class AgentStates:
         )
 
     def select(self, agents: Bools | Ints) -> "AgentStates":
-        """Some of the agents, by mask [N] or indices [n]."""
+        """Return some of the agents, by mask [N] or indices [n]."""
         return AgentStates(**{field.name: getattr(self, field.name)[agents] for field in fields(self)})
 
 
 @dataclass(frozen=True)
 class Raster:
-    """The map of a scene: layers 0 driveable area, 1 road dividers, 2 lane dividers.
+    """The map of a scene, in three layers: 0 drivable area, 1 road dividers, 2 lane dividers.
 
     Element [layer, i, j] shows the ground point ``origin + (i, j) / pixels_per_meter``.
     """
@@ -95,12 +95,13 @@ class Scene:
     states: AgentStates
     raster: Raster | None = None
     patches: dict[int, Bytes | Float32s] = field(default_factory=dict)
-    """Agents' own map patches by agent index, each [3, 100, 100] in [0, 1]; they go before the raster."""
+    """Agents' own map patches by agent index, each [3, 100, 100] in [0, 1]; they take precedence over the
+    raster."""
     far_patches: dict[int, Bytes | Float32s] = field(default_factory=dict)
-    """The same of what lies farther, each [3, 100, 100] in [0, 1], 1.4 pixels per metre: element
-    [layer, i, j] shows the point (i − 14)/1.4 m ahead and (j − 50)/1.4 m to the left. They, too, go before
-    the raster."""
+    """Agents' own far map patches, each [3, 100, 100] in [0, 1], 1.4 pixels per metre: element [layer, i, j]
+    shows the point (i − 14)/1.4 m ahead and (j − 50)/1.4 m to the left. They, too, take precedence over the
+    raster."""
 
     def of_type(self, kind: AgentType) -> Bools:
-        """[N], which agents are of that type."""
+        """Return a mask of the agents of that type: [N]."""
         return np.array([t is kind for t in self.types], dtype=np.bool_)
