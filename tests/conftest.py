@@ -1,4 +1,4 @@
-"""What all tests share."""
+"""Fixtures of all tests."""
 
 import os
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The folder with golden files and real nuScenes data; it lies beside the checkout, never in it."""
+    """Return the folder with golden files and real nuScenes data, which lies beside the checkout."""
     here = Path(__file__).resolve().parents[1]
     folder = Path(os.environ.get("CAB_FORECAST_SHARED", here.parent / "shared"))
     if not folder.is_dir():

@@ -1,4 +1,4 @@
-"""What a planner may expect of each kind of case: readings, and the bands that they must lie in."""
+"""Readings of a forecast for each kind of case, and the bands in which a planner expects them."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -15,12 +15,12 @@ HORIZON = 6.0
 """s."""
 _COVERNET = "covernet"
 _COVERNET_TOLERANCE = 2.0
-"""m; its set of trajectories covers what was driven within so much."""
+"""m; CoverNet's trajectory set covers the recorded trajectories to within this distance."""
 
 
 @dataclass(frozen=True)
 class Reading:
-    """A quantity and its band; NaN: it has no value here, and fails nothing."""
+    """A quantity and its band; NaN, a quantity without a value, is in every band."""
 
     what: str
     value: float
@@ -29,17 +29,17 @@ class Reading:
 
     @property
     def judged(self) -> bool:
-        """Whether there is a band."""
+        """Return whether there is a band."""
         return self.low > -math.inf or self.high < math.inf
 
     @property
     def ok(self) -> bool:
-        """Whether it lies in its band."""
+        """Return whether the value lies in its band."""
         return math.isnan(self.value) or self.low <= self.value <= self.high
 
     @property
     def band(self) -> str:
-        """The band in words."""
+        """Return the band as text."""
         if self.low > -math.inf and self.high < math.inf:
             return f"{self.low:.3g} … {self.high:.3g}"
         if self.judged:
@@ -53,20 +53,20 @@ class Reading:
 def readings(
     case: Case, forecast: LocalForecast, companion: LocalForecast | None = None, model: str = ""
 ) -> list[Reading]:
-    """Return what the row of a case says of a forecast.
+    """Return the readings of a forecast for the row of its case.
 
     Args:
-        case: what was asked.
-        forecast: of its car.
-        companion: of the case that its facts name.
-        model: its name; CoverNet's tolerances are wider.
+        case: the case.
+        forecast: the forecast of its car.
+        companion: the forecast of the case that ``facts.companion`` names.
+        model: the model's name; CoverNet's tolerances are wider.
     """
     slack = _COVERNET_TOLERANCE if model == _COVERNET else 0.0
     return list(_ROWS[case.row](case, forecast, companion, slack))
 
 
 def widths(forecast: LocalForecast) -> list[Reading]:
-    """Return what holds of the standard deviations in every case."""
+    """Return the readings of standard deviations, which every case has."""
     return [
         Reading("narrow σ at 1 s", checks.narrow_sigma(forecast, 1.0), low=0.1 - 1e-6),
         Reading("narrow σ at 6 s", checks.narrow_sigma(forecast, HORIZON), low=0.3 - 1e-6),
@@ -74,7 +74,7 @@ def widths(forecast: LocalForecast) -> list[Reading]:
 
 
 def few_modes(forecast: LocalForecast) -> list[Reading]:
-    """Return what holds of the number of modes in every case."""
+    """Return the readings of the number of modes, which every case has."""
     return [
         Reading("modes for 90 %", checks.modes_for(forecast.weights, 0.9)),
         Reading("merged modes for 90 %", checks.merged_modes_for(forecast, 0.9), high=6),
@@ -250,7 +250,7 @@ def _short(
 
 
 def _distance(forecast: LocalForecast, seconds: float) -> float:
-    """Return how far the likeliest mode is from the start then, m."""
+    """Return the distance of the most likely mode from the start after ``seconds``, m."""
     return float(np.linalg.norm(forecast.likeliest[step(seconds)]))
 
 

@@ -1,4 +1,4 @@
-"""A made-up scene with one car in it, and what is known of that car."""
+"""A made-up scene with one car, and the true state of that car."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -15,17 +15,17 @@ from model.geometry import rotate
 from model.scenes.scene import Raster
 
 CAR = "car"
-"""Id of the agent that is asked about."""
+"""Id of the agent under test."""
 NOW = 1_700_000_000.0
 """s; the present of every scene built here."""
 MARGIN = 85.0
-"""m that a raster reaches beyond the car and beyond where it may be in 6 s."""
+"""m by which a raster extends beyond the car and beyond its possible positions in 6 s."""
 PIXELS_PER_METER = 3.0
 
 Road = Callable[[Floats, Floats], Bools]
 """Layers [3, ...] (driveable area, road dividers, lane dividers) at the points x, y [...], m, of a scene."""
 View = Literal["raster", "patch", "none"]
-"""How a request shows the map: one raster of the scene, the car's own patches, or not at all."""
+"""The map in a request: one raster of the scene, the car's own patches, or none."""
 
 
 class Row(StrEnum):
@@ -51,25 +51,25 @@ class Row(StrEnum):
 
 @dataclass(frozen=True)
 class Facts:
-    """What a judge knows of the car now, noise apart."""
+    """The true state of the car now, without noise."""
 
     speed: float
     """m/s along the heading; negative: it reverses."""
     acceleration: float = 0.0
     """m/s² along the heading."""
     turned: float = 0.0
-    """rad to the left that it has turned since it came to the junction."""
+    """rad by which the car has turned left since it entered the junction."""
     noisy: bool = False
-    """Whether the observations are."""
+    """Whether the observations are noisy."""
     oriented: bool = True
-    """Whether the observations tell its heading."""
+    """Whether the observations determine the heading."""
     companion: str = ""
-    """Name of the case that this one is compared with: the same drive, clean and with its whole history."""
+    """Name of the case to compare with: the same drive without noise and with the full history."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The car's own frame: origin where it is, x along its heading, y to its left (mirrored: its right)."""
+    """The car's own frame: origin at the car, x along its heading, y to its left (mirrored: to its right)."""
 
     position: Floats
     """[2], m, ground frame."""
@@ -99,26 +99,26 @@ class Frame:
 
 @dataclass(frozen=True)
 class Case:
-    """A request, and what its answer is judged by."""
+    """A request and the ground truth that its forecast is checked against."""
 
     name: str
     row: Row
     request: pb.PredictRequest
     frame: Frame
-    """Of the car, where it truly is."""
+    """The car's true frame."""
     facts: Facts
     raster: Raster | None = None
-    """The map; None: there is none."""
+    """The map; None: no map."""
     lead: Frame | None = None
     """A standing car ahead, relative to the car's frame."""
 
 
 @dataclass(frozen=True)
 class Track:
-    """What was observed of an agent, in the scene's own frame."""
+    """The observations of an agent, in the scene's own frame."""
 
     times: Floats
-    """[F], s from now, none positive."""
+    """[F], s relative to now, none positive."""
     positions: Floats
     """[F, 2], m."""
     headings: Floats | None = None
@@ -129,7 +129,7 @@ class Track:
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a scene lies on the ground: it is mirrored first, then turned, then shifted."""
+    """A scene's pose on the ground: it is first mirrored, then rotated, then shifted."""
 
     x: float = 0.0
     y: float = 0.0
@@ -144,29 +144,29 @@ class Pose:
 
 @dataclass(frozen=True)
 class Scenario:
-    """A scene in its own frame: roads run along x, or begin so; the car drives towards +x, on the right."""
+    """A scene in its own frame: roads start along x, the car drives towards +x on the right."""
 
     name: str
     row: Row
     car: Track
     position: Floats
-    """[2], m, where the car truly is now."""
+    """[2], m, the car's true position now."""
     heading: float
-    """rad, the car's true one now."""
+    """rad, the car's true heading now."""
     facts: Facts
     road: Road | None = None
     lead: Track | None = None
     """A standing car."""
     pose: Pose = Pose()
     extent: tuple[tuple[float, float], tuple[float, float]] | None = None
-    """Least and greatest x and y, m, of where the car may be in 6 s; None: straight ahead of it."""
+    """Min and max x and y, m, of the car's possible positions in 6 s; None: straight ahead of it."""
 
     def at(self, pose: Pose) -> "Scenario":
-        """Return the same scene elsewhere on the ground."""
+        """Return the scene at another pose."""
         return replace(self, pose=pose)
 
     def case(self, view: View = "raster") -> Case:
-        """Return the request of this scene, the map shown as ``view`` says."""
+        """Return the request of this scene with the map as ``view``."""
         scene = self.pose.frame()
         sign = -1.0 if self.pose.mirrored else 1.0
         frame = Frame(
@@ -193,15 +193,14 @@ class Scenario:
         return Frame(car.to_local(self.lead.positions[-1]), float(self.lead.headings[-1]) - self.heading)
 
     def _raster(self, road: Road) -> tuple[Raster, pb.SceneRaster]:
-        """Return the road as a raster that reaches 85 m beyond all places where the car may be in 6 s, as the
-        judge has it and as it is sent."""
+        """Return a raster that extends 85 m beyond the car's possible positions in 6 s, and its message."""
         ahead = rotate(np.array([6.0 * max(self.facts.speed, 0.0) + 40.0, 0.0]), np.array(self.heading))
         ends = np.stack([self.position, self.position + ahead])
         low, high = self.extent or (tuple(ends.min(0)), tuple(ends.max(0)))
         return _paint(road, self.pose, low, high)
 
     def _patch(self, road: Road, pixels_per_meter: float, behind: int) -> Bools:
-        """Return a patch of the car's own, painted anew in its own frame, with so many rows behind it."""
+        """Return a patch painted in the car's own frame, with ``behind`` rows behind the car."""
         ahead, left = (np.arange(100) - behind) / pixels_per_meter, (np.arange(100) - 50) / pixels_per_meter
         points = np.stack(np.meshgrid(ahead, left, indexing="ij"), axis=-1)
         if self.pose.mirrored:
@@ -223,11 +222,11 @@ def _agent(name: str, track: Track, scene: Frame) -> pb.Agent:
     )
 
 
-@lru_cache(maxsize=4)  # successive scenes of one drive share theirs
+@lru_cache(maxsize=4)  # successive scenes of one drive share their raster
 def _paint(
     road: Road, pose: Pose, low: tuple[float, float], high: tuple[float, float]
 ) -> tuple[Raster, pb.SceneRaster]:
-    """Return the raster of a road that reaches beyond an extent in the scene's frame, and its message."""
+    """Return a raster that extends beyond ``low`` and ``high`` in the scene's frame, and its message."""
     (left, bottom), (right, top) = low, high
     corners = [(x, y) for x in (left - MARGIN, right + MARGIN) for y in (bottom - MARGIN, top + MARGIN)]
     scene = pose.frame()

@@ -1,4 +1,4 @@
-"""Drives of 100 ticks at 10 Hz: the likeliest forecast of one and the same time must not jump."""
+"""Drives of 100 ticks at 10 Hz, in which the most likely forecast for a given time must not jump."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,17 +18,17 @@ _OUTER = -1.5 * LANE
 
 @dataclass(frozen=True)
 class Drive:
-    """Successive scenes of one car, and the bands of its jumps."""
+    """Successive scenes of one car, and the bands of its forecasts' jumps."""
 
     name: str
     ticks: Sequence[Scenario]
     median: float
-    """m, that half of the jumps stay within."""
+    """Max median of the jumps, m."""
     largest: float
-    """m, that all stay within."""
+    """Max jump, m."""
 
     def readings(self, found: Sequence[LocalForecast]) -> list[Reading]:
-        """Return the jumps of the forecasts of all ticks, in order."""
+        """Return the readings of the forecasts of all ticks, in order."""
         paths: Floats = np.stack([one.frame.to_ground(one.likeliest) for one in found])
         sizes = jumps(paths, 1 / RATE)
         return [
@@ -38,9 +38,8 @@ class Drive:
 
 
 def drives() -> list[Drive]:
-    """Return the drives: with 5 cm and 0.02 rad of noise straight on, and out of a straight road into a
-    curve; with 3 cm and 0.01 rad at a red light."""
-
+    """Return the drives: straight on and from a straight road into a curve with 5 cm and 0.02 rad of noise,
+    and waiting at a red light with 3 cm and 0.01 rad."""
     rough, still = {"noise": 0.05, "heading_noise": 0.02}, {"noise": 0.03, "heading_noise": 0.01}
     bend = left_arc(np.array([0.0, _OUTER]), 60.0 - _OUTER, -50.0)
     wait = line(STOP_X, -LANE / 2)

@@ -1,4 +1,4 @@
-"""The cases that lie in the folder shared/, whose numbers are not ours."""
+"""The cases of the folder shared/, which are given from outside the project."""
 
 import math
 from pathlib import Path
@@ -46,15 +46,15 @@ KNOWN: dict[str, tuple[Row, tuple[float, float], Facts]] = {
     "two_states_0.1": (Row.SHORT, _OUTER, Facts(10.0, companion=_CLEAN)),
     "two_states_0.5": (Row.SHORT, _OUTER, Facts(10.0, companion=_CLEAN)),
 }
-"""By file: row of the table, where the car truly is, and the rest; its heading is ``turned``."""
+"""The row, true position and true state of the car, by file name; the true heading is ``turned``."""
 
 
 def read_cases(folder: Path) -> list[Case]:
     """Return the cases of a folder, in the order of the table.
 
     Raises:
-        FileNotFoundError: one of them is not there.
-        ValueError: there is one that nothing is known of.
+        FileNotFoundError: a known case is missing.
+        ValueError: the folder holds an unknown case.
     """
     unknown = {file.stem for file in folder.glob("*.json")} - set(KNOWN)
     if unknown:

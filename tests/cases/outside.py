@@ -1,7 +1,7 @@
-"""Scenes in which the bundled model is known to be out of its band.
+"""Cases in which the bundled model is known to be out of its band.
 
-Each is expected to fail, strictly: a model that mends one has to take it from here. What the bands are is no
-matter of this list.
+They are strict expected failures: a model that passes one must remove it from this list. The bands themselves
+do not depend on it.
 """
 
 OUTSIDE: dict[str, frozenset[str]] = {
@@ -49,4 +49,4 @@ OUTSIDE: dict[str, frozenset[str]] = {
         }
     ),
 }
-"""Names of scenes, drives and views by what is asked of them."""
+"""Names of scenes, drives and views, by test."""

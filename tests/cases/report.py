@@ -1,4 +1,4 @@
-"""Every case, measured and judged: ``python -m tests.cases.report --model cab`` or ``--checkpoint DIR``."""
+"""A table of every case's readings: ``python -m tests.cases.report --model cab`` or ``--checkpoint DIR``."""
 
 import argparse
 import logging
@@ -19,9 +19,9 @@ from tests.cases.case import Case, Pose, Scenario, View
 from tests.cases.running import Served, bundled, from_checkpoint
 
 _TURNS = (0.5 * math.pi, 2.3, -1.1)
-"""rad, that scenes are turned by."""
+"""rad by which scenes are rotated."""
 TURNED_WITHIN: dict[View, float] = {"none": 0.01, "patch": 0.01, "raster": 0.5}
-"""m, by how the map is shown."""
+"""Max distance between the forecasts of rotated scenes, m, by view of the map."""
 _TURNED = ("standing", "straight 9", "curve 62", "junction in 22 m", "lead in 24 m")
 
 
@@ -44,7 +44,7 @@ def judged(cases: Sequence[Case], served: Served) -> list[tuple[Case, list[Readi
 
 
 def turned(scenarios: Iterable[Scenario], served: Served) -> list[tuple[str, list[Reading]]]:
-    """Return how far the forecasts of turned and shifted scenes are from the turned forecasts."""
+    """Return the distances between forecasts of rotated and shifted scenes, each in the scene's own frame."""
     table = []
     for scenario in scenarios:
         poses = [Pose(), *(Pose(150.0 * turn, -80.0, turn) for turn in _TURNS)]
@@ -60,7 +60,7 @@ def turned(scenarios: Iterable[Scenario], served: Served) -> list[tuple[str, lis
 
 
 def steady(served: Served) -> list[tuple[str, list[Reading]]]:
-    """Return how far the likeliest end jumps from tick to tick."""
+    """Return the jumps of the most likely end from tick to tick."""
     return [
         (drive.name, drive.readings(served.answer([one.case() for one in drive.ticks])))
         for drive in driving.drives()
@@ -68,15 +68,15 @@ def steady(served: Served) -> list[tuple[str, list[Reading]]]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the table; return how many readings are outside their bands."""
+    """Print the table; return the number of readings outside their bands."""
     parser = argparse.ArgumentParser(prog="python -m tests.cases.report", description=__doc__)
     model = parser.add_mutually_exclusive_group()
     model.add_argument("--model", default="cab", help="a bundled model, name or name@version")
-    model.add_argument("--checkpoint", type=Path, help="a checkpoint's folder instead")
+    model.add_argument("--checkpoint", type=Path, help="a checkpoint's folder, instead of a bundled model")
     parser.add_argument("--shared", type=Path, help="folder of the shared cases")
-    parser.add_argument("--only", default="", help="cases whose name or row holds this")
-    parser.add_argument("--failures", action="store_true", help="print what is outside its band only")
-    parser.add_argument("--no-series", action="store_true", help="leave out turned scenes and ticks")
+    parser.add_argument("--only", default="", help="only cases whose name or row contains this")
+    parser.add_argument("--failures", action="store_true", help="print only readings outside their bands")
+    parser.add_argument("--no-series", action="store_true", help="leave out rotated scenes and drives")
     chosen = parser.parse_args(arguments)
 
     started = time.perf_counter()

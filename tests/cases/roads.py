@@ -1,4 +1,4 @@
-"""Roads to paint: each function returns one, in a scene's own frame, traffic on the right."""
+"""Roads in a scene's own frame, with right-hand traffic; each function returns one, to be painted."""
 
 from functools import partial
 
@@ -12,23 +12,23 @@ _LANE_DIVIDER_WIDTH = 0.4
 
 
 def straight(lanes: int, lane_width: float) -> Road:
-    """Return a road along x, its middle at y = 0.
+    """Return a road along x, with its centre line at y = 0.
 
     Args:
-        lanes: each way.
-        lane_width: m.
+        lanes: lanes per direction.
+        lane_width: width of a lane, m.
     """
     return lambda x, y: _across(y, lanes, lane_width)
 
 
 def curve(radius: float, lanes: int, lane_width: float, arc: float = 2.2) -> Road:
-    """Return a road that comes along x, turns left from x = 0 on, and goes straight on after that.
+    """Return a road that runs along x, turns left from x = 0 on, and then continues straight.
 
     Args:
-        radius: of its middle, m.
-        lanes: each way.
-        lane_width: m.
-        arc: rad that it turns, less than π.
+        radius: radius of the centre line, m.
+        lanes: lanes per direction.
+        lane_width: width of a lane, m.
+        arc: angle of the turn, rad, less than π.
     """
 
     def paint(x: Floats, y: Floats) -> Bools:
@@ -48,12 +48,12 @@ def curve(radius: float, lanes: int, lane_width: float, arc: float = 2.2) -> Roa
 
 
 def junction(lanes: int, lane_width: float, kerb_radius: float) -> Road:
-    """Return two roads that cross at the origin, one along x, one along y, without paint where they meet.
+    """Return two roads that cross at the origin, along x and along y, without markings where they meet.
 
     Args:
-        lanes: each way, on each road.
-        lane_width: m.
-        kerb_radius: of the rounded corners, m.
+        lanes: lanes per direction of each road.
+        lane_width: width of a lane, m.
+        kerb_radius: radius of the rounded corners, m.
     """
     half = lanes * lane_width
     stop = half + kerb_radius
@@ -70,7 +70,7 @@ def junction(lanes: int, lane_width: float, kerb_radius: float) -> Road:
 
 
 def _across(offset: Floats, lanes: int, lane_width: float) -> Bools:
-    """Return the layers [3, ...] at points so far to the left of a road's middle, m."""
+    """Return the layers [3, ...] at points ``offset`` m to the left of a road's centre line."""
     line = partial(_line, np.abs(offset))
     dividers = np.zeros(offset.shape, dtype=np.bool_)
     for lane in range(1, lanes):

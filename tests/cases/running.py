@@ -1,4 +1,4 @@
-"""Cases through the service's own core, in this process."""
+"""Cases run through the service's pipeline in this process."""
 
 import asyncio
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from tests.service.fakes import registry
 from tests.service.servers import settings
 
 _AT_ONCE = 16
-"""Calls in flight."""
+"""Max calls in flight."""
 
 
 def bundled(name: str) -> Forecaster:
@@ -28,10 +28,10 @@ def bundled(name: str) -> Forecaster:
 
 
 def network_frame(info: ModelInfo) -> str:
-    """Return in which frame a bundled model's network sees the world: "agent" or "ground".
+    """Return the frame of a bundled model's network: "agent" or "ground".
 
     Raises:
-        ValueError: it has no checkpoint.
+        ValueError: the model has no checkpoint.
     """
     folder = bundled_models()
     for checkpoint in () if folder is None else load_checkpoints(folder):
@@ -46,11 +46,11 @@ def from_checkpoint(folder: Path) -> Forecaster:
 
 
 class Served:
-    """A context manager: a model behind the service's core, and the baselines for what it cannot forecast."""
+    """A context manager: a model in the service's pipeline, with the baselines as its fallbacks."""
 
     def __init__(self, forecaster: Forecaster) -> None:
         self.info = forecaster.info
-        """What is known of the model."""
+        """The model's info."""
         self._forecaster = forecaster
         self._runner = asyncio.Runner()
         own = settings(default_model=forecaster.info.name, max_batch_agents=_AT_ONCE)
@@ -70,7 +70,7 @@ class Served:
         return alone if self.info in alone.infos() else registry(self._forecaster)
 
     def answer(self, cases: Sequence[Case]) -> list[LocalForecast]:
-        """Return the forecast of each case's car, made as the server makes it: from request to answer.
+        """Return the forecast of each case's car, from request to response as in the server.
 
         Raises:
             ValueError: a car has no forecast.

@@ -1,4 +1,4 @@
-"""Made-up scenes for every row of the table of right answers, with numbers of our own."""
+"""Made-up scenes for every row, with the project's own numbers."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -12,16 +12,16 @@ from tests.cases import roads
 from tests.cases.case import NOW, Facts, Pose, Road, Row, Scenario, Track
 
 Path = Callable[[Floats], tuple[Floats, Floats]]
-"""Position [F, 2], m, and heading [F], rad, so many metres [F] along the way from where the car is now."""
+"""Position [F, 2], m, and heading [F], rad, at distances [F], m, along the path from the car's position."""
 
 LANE = 3.6
-"""m, width of a lane."""
+"""Width of a lane, m."""
 HISTORY = 2.8
-"""s that a car is observed, unless the case is about less."""
+"""s of observations, except in cases about short histories."""
 RATE = 10.0
-"""Hz, likewise."""
+"""Hz of observations, unless a case sets another."""
 STOP_X = -14.0
-"""m, where a car waits for a red light."""
+"""m, the position of a car that waits at a red light."""
 
 
 def line(x: float, y: float, heading: float = 0.0) -> Path:
@@ -31,13 +31,13 @@ def line(x: float, y: float, heading: float = 0.0) -> Path:
 
 
 def left_arc(start: Floats, radius: float, at: float, arc: float = math.inf) -> Path:
-    """Return a path along x that turns left at a point, and goes straight on after that.
+    """Return a path along x that turns left at a point and then continues straight.
 
     Args:
-        start: [2], m, where it begins to turn.
-        radius: m.
-        at: m, how far beyond that point the car is now; negative: before it.
-        arc: rad that it turns.
+        start: start of the turn, [2], m.
+        radius: radius of the turn, m.
+        at: distance of the car beyond that point now, m; negative: before it.
+        arc: angle of the turn, rad.
     """
 
     def path(s: Floats) -> tuple[Floats, Floats]:
@@ -66,16 +66,16 @@ def standing(
     """Return a car that waits at a junction.
 
     Args:
-        name: of the case.
-        heading: of the whole scene, rad.
-        slip: m/s to the left that the observations say it moves.
-        noise: m, of positions.
-        heading_noise: rad, where there is noise.
+        name: name of the case.
+        heading: heading of the whole scene, rad.
+        slip: observed velocity to the left, m/s.
+        noise: standard deviation of positions, m.
+        heading_noise: standard deviation of headings, rad; without effect if ``noise`` is 0.
         oriented: whether headings are observed.
-        exact: whether velocities are.
-        rate: Hz.
-        seed: of the noise.
-        row: of the table.
+        exact: whether velocities are observed.
+        rate: rate of observations, Hz.
+        seed: seed of the noise.
+        row: row of the case.
     """
     times = _times(rate)
     positions = np.array([STOP_X, -LANE / 2]) + np.stack([np.zeros_like(times), slip * times], axis=-1)
@@ -122,21 +122,21 @@ def drive(
     """Return a car that drives along a path.
 
     Args:
-        name: of the case.
-        row: of the table.
-        path: where it drives.
-        speed: along the path now, m/s.
-        acceleration: along the path as long as it moved, m/s².
-        road: the map; None: two lanes of 3.6 m each way, straight along x.
-        rate: Hz.
-        history: s.
-        noise: m, of positions.
-        heading_noise: rad.
-        headings: whether they are observed.
-        velocities: whether they are.
-        reverse: whether it looks back along the path.
+        name: name of the case.
+        row: row of the case.
+        path: path of the car.
+        speed: speed along the path now, m/s.
+        acceleration: acceleration along the path while the car moves, m/s².
+        road: the map; None: a straight road along x, two lanes of 3.6 m per direction.
+        rate: rate of observations, Hz.
+        history: duration of the observations, s.
+        noise: standard deviation of positions, m.
+        heading_noise: standard deviation of headings, rad.
+        headings: whether headings are observed.
+        velocities: whether velocities are observed.
+        reverse: whether the car drives backwards.
         turned: see ``Facts``.
-        seed: of the noise.
+        seed: seed of the noise.
         companion: see ``Facts``.
     """
     times = _times(rate, history)
@@ -165,8 +165,8 @@ def drive(
 def driven(
     path: Path, times: Floats, speed: float, acceleration: float = 0.0, reverse: bool = False
 ) -> Track:
-    """Return what is observed without noise of a car at times [F], s from now; arguments as of ``drive``."""
-    began = -speed / acceleration if acceleration > 0 else -math.inf  # before that it stood
+    """Return the noise-free observations of a car at times [F], s from now; arguments as in ``drive``."""
+    began = -speed / acceleration if acceleration > 0 else -math.inf  # until then the car stood
     clipped = np.maximum(times, began)
     speeds = np.where(times < began, 0.0, speed + acceleration * times)
     positions, headings = path(speed * clipped + acceleration * clipped**2 / 2)
@@ -194,14 +194,14 @@ def heading_flip(name: str, speed: float, rate: float) -> Scenario:
 
 
 def jitter(name: str, speed: float, spread: float, seed: int, *, told: bool) -> Scenario:
-    """Return a car that is seen at times that lie up to ``spread`` s off the grid.
+    """Return a car observed at times up to ``spread`` s off the grid.
 
     Args:
-        name: of the case.
-        speed: m/s.
-        spread: s.
-        seed: of the times.
-        told: whether the observations carry those times, rather than the grid's.
+        name: name of the case.
+        speed: speed, m/s.
+        spread: max deviation, s.
+        seed: seed of the times.
+        told: whether the observations carry the true times rather than the grid's.
     """
     scenario = drive(name, Row.STRAIGHT, line(0.0, -1.5 * LANE), speed, headings=False, velocities=False)
     grid = scenario.car.times
@@ -218,20 +218,20 @@ def jitter(name: str, speed: float, spread: float, seed: int, *, told: bool) -> 
 
 
 def standing_lead(name: str, speed: float, ahead: float, *, y: float = -LANE / 2) -> Scenario:
-    """Return a car that drives towards a standing one, ``ahead`` m from middle to middle."""
+    """Return a car that drives towards a standing car, whose centre is ``ahead`` m ahead of its own."""
     scenario = drive(name, Row.LEAD, line(0.0, y), speed)
     lead = driven(line(ahead, y), scenario.car.times, 0.0)
     return replace(scenario, lead=lead)
 
 
 def without_map(scenario: Scenario, name: str) -> Scenario:
-    """Return the same scene, of which no map is known."""
+    """Return the same scene without a map."""
     return replace(scenario, name=name, road=None)
 
 
 def at_poses(scenarios: Sequence[Scenario]) -> list[Scenario]:
-    """Return each scene once, turned by an angle of its own, every third one mirrored, far from the ground
-    frame's origin."""
+    """Return each scene once, rotated by its own angle and far from the ground frame's origin, every third
+    one mirrored."""
     generator = np.random.default_rng(5)
     placed = []
     for number, scenario in enumerate(scenarios):
@@ -395,16 +395,17 @@ def all_rows() -> list[Scenario]:
 def ticks(
     path: Path, speed: float, road: Road, count: int, *, noise: float, heading_noise: float
 ) -> list[Scenario]:
-    """Return what is known of a car at so many successive times 0.1 s apart. Its noise is that of the
-    observations: each has one, whatever tick looks at it. The path gives where it is at the first tick.
+    """Return the scenes of one car at ``count`` successive ticks, 0.1 s apart.
+
+    An observation has the same noise in every tick. The path starts at the car's position at the first tick.
 
     Args:
-        path: where it drives.
-        speed: m/s.
+        path: path of the car.
+        speed: speed, m/s.
         road: the map.
-        count: of ticks.
-        noise: m.
-        heading_noise: rad.
+        count: number of ticks.
+        noise: standard deviation of positions, m.
+        heading_noise: standard deviation of headings, rad.
     """
     frames = round(HISTORY * RATE) + 1
     times = np.arange(1 - frames, count) / RATE
@@ -432,7 +433,7 @@ def ticks(
 
 
 def _times(rate: float, history: float = HISTORY) -> Floats:
-    """Return the times of observations, s from now, as they differ from the present in float64."""
+    """Return the times of observations, s relative to now, after rounding to float64 as absolute times."""
     count = math.floor(history * rate + 1e-6) + 1
     ages = np.arange(count - 1, -1, -1) / rate
     return (NOW - ages) - NOW

@@ -1,4 +1,4 @@
-"""The bundled default model on made-up scenes: what a planner may expect of it, row by row."""
+"""The bundled default model on made-up scenes, checked against a planner's expectations."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -26,18 +26,18 @@ DRIVES = {one.name: one for one in driving.drives()}
 
 
 def known(asked: str, names: Iterable[str]) -> list[pytest.ParameterSet]:
-    """Return parameters, those that are known to be out of their bands expected to fail."""
+    """Return test parameters; those known to be out of their bands are expected to fail."""
     fails = pytest.mark.xfail(strict=True, raises=AssertionError, reason="known to be out of its band")
     return [pytest.param(name, marks=[fails] if name in OUTSIDE[asked] else []) for name in names]
 
 
 Answers = dict[str, tuple[Case, LocalForecast]]
-"""By the case's name."""
+"""Cases and their forecasts, by name."""
 
 
 @pytest.fixture(scope="module")
 def served() -> Iterator[Served]:
-    """The model; models of the ground frame are known to be out of the bands, and are not asked."""
+    """Serve the model; skip models of the ground frame, which are known to be out of the bands."""
     with Served(bundled(MODEL)) as model:
         frame = network_frame(model.info)
         if frame != "agent":
@@ -47,13 +47,13 @@ def served() -> Iterator[Served]:
 
 @pytest.fixture(scope="module")
 def own(served: Served) -> Answers:
-    """Forecasts of the scenes with numbers of our own."""
+    """Forecast the project's own scenes."""
     return _answers(served, [scenario.case() for scenario in SCENARIOS.values()])
 
 
 @pytest.fixture(scope="module")
 def given_cases(served: Served, shared: Path) -> Answers:
-    """Forecasts of the cases beside the checkout."""
+    """Forecast the cases of the folder shared/."""
     folder = shared / "cases"
     if not folder.is_dir():
         pytest.skip(f"the shared cases are not here: {folder}")
@@ -93,7 +93,7 @@ def test_the_likeliest_end_does_not_jump_from_tick_to_tick(served: Served, name:
 
 @pytest.mark.parametrize("view", known("turned", get_args(View)))
 def test_a_turned_and_shifted_scene_has_the_turned_forecasts(served: Served, view: View) -> None:
-    # A failure is not shrunk: every example takes a forward, and any angle tells as much as another
+    # Failures are not shrunk: every example takes a forward pass, and all angles are equally informative
     @settings(
         max_examples=12, deadline=None, derandomize=True, phases=[Phase.explicit, Phase.reuse, Phase.generate]
     )

@@ -1,4 +1,4 @@
-"""The checks, on forecasts whose quantities are known."""
+"""Tests of the checks on forecasts with known quantities."""
 
 import math
 from dataclasses import replace
@@ -23,7 +23,7 @@ SCENARIOS = {one.name: one for one in scenes.all_rows()}
 
 
 def _forecast(*paths: Floats, weights: list[float] | None = None, sigma: float = 0.01) -> LocalForecast:
-    """Return a forecast of modes that are so many metres wide each."""
+    """Return a forecast whose modes have the given standard deviations, m."""
     count = len(paths)
     return LocalForecast(
         HERE,
@@ -63,7 +63,7 @@ def test_a_left_turn_is_one_wherever_the_scene_lies(mirrored: bool) -> None:
     local = case.frame.to_local(np.array([[state.x, state.y] for state in states]))
     np.testing.assert_allclose(local[-1], 0.0, atol=1e-9)
     assert (local[:-1, 0] < 0).all()
-    assert local[0, 1] > 1.0  # where it came from lies to the left of how it looks now
+    assert local[0, 1] > 1.0  # the origin of the turn lies to the left of the current heading
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
@@ -170,7 +170,7 @@ def test_who_drives_as_forecast_does_not_jump() -> None:
 
 
 def test_constant_velocity_meets_what_it_must() -> None:
-    """It knows neither roads nor noise, but turns with the scene, and drives clean straight roads right."""
+    """It ignores roads and noise, but rotates with the scene and is right on straight roads without noise."""
     with Served(next(one for one in baselines() if one.info.name == "constant-velocity-yaw")) as served:
         straight = [one for one in SCENARIOS.values() if one.row in (Row.STRAIGHT, Row.HIGHWAY, Row.CREEPING)]
         clean = [one.case() for one in scenes.at_poses(straight) if not one.facts.noisy]

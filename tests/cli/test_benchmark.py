@@ -29,26 +29,26 @@ DEADLINE = 120.0
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """A data set of the layout nuscenes_pred."""
+    """Write a data set in the layout nuscenes_pred."""
     return f"nuscenes_pred:{write_nuscenes_pred(tmp_path_factory.mktemp('data'))}"
 
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """A server with two learned models and the baselines."""
+    """Serve two learned models and the baselines."""
     folder = checkpoints(tmp_path_factory.mktemp("models"))
     with in_thread(settings(models=folder, default_model="kalman")) as running:
         yield running
 
 
 def run(*arguments: str) -> tuple[int, str, str]:
-    """Exit code, standard output, standard error in one line."""
+    """Return the exit code, standard output, and standard error on one line."""
     result = CliRunner().invoke(app, ["benchmark", *arguments])
     return result.exit_code, result.stdout, " ".join(result.stderr.split())
 
 
 def results(folder: Path) -> dict[str, Any]:
-    """What was written, without what the clock told."""
+    """Read the results, without the measured latencies."""
     read: dict[str, Any] = json.loads((folder / "results.json").read_text())
     for model in read["models"]:
         del model["latency"]
@@ -68,7 +68,7 @@ def test_the_tables_of_a_run_and_of_its_saved_answers(tmp_path: Path, data: str,
         assert text in (out / "tables.md").read_text()
     assert "requested" in said
     assert len(results(out)["models"]) == 8
-    # Again from what is saved, without an endpoint, into another folder
+    # Again from the saved responses, without an endpoint, into another folder
     code, _, said = run(
         "--data",
         data,
@@ -109,14 +109,14 @@ def test_a_run_that_was_killed_goes_on_to_the_same_result(tmp_path: Path, data: 
     assert run(*arguments, "--out", str(killed))[0] == 0
     assert run(*arguments, "--out", str(whole))[0] == 0
     after = rows(killed)
-    assert had.items() <= after.items()  # not asked again: the clock's reading is the old one
+    assert had.items() <= after.items()  # not requested again: the durations are the old ones
     assert after.keys() == rows(whole).keys()
     assert len(after) > len(had)
     assert results(killed) == results(whole)
 
 
 def rows(folder: Path) -> dict[tuple[str, str, int], float]:
-    """Seconds of every saved answer."""
+    """Return the duration of every saved response, s."""
     file = sqlite3.connect(folder / FILE)
     try:
         found = file.execute("SELECT model, scene, frame, seconds FROM answers").fetchall()
@@ -126,15 +126,15 @@ def rows(folder: Path) -> dict[tuple[str, str, int], float]:
 
 
 def answered(folder: Path) -> int:
-    """How many answers there are so far."""
+    """Return the number of saved responses."""
     try:
         return len(rows(folder)) if (folder / FILE).exists() else 0
-    except sqlite3.OperationalError:  # its tables are about to be made
+    except sqlite3.OperationalError:  # its tables do not exist yet
         return 0
 
 
 def test_missing_forecasts_end_in_an_error(tmp_path: Path, data: str) -> None:
-    """A server that takes fewer agents than a frame has refuses such calls."""
+    """A server with a limit below a frame's number of agents rejects its request."""
     tight = settings(models=tmp_path / "none", default_model="kalman", max_agents=3)
     (tmp_path / "none").mkdir()
     with in_thread(tight) as server:
@@ -208,7 +208,7 @@ def test_what_cannot_be_done_is_said(
 
 
 def test_the_data_on_disk_is_the_one_in_memory(data: str) -> None:
-    """Of the vehicles: the layout has no others."""
+    """The layout has vehicles only."""
     kind, path = parse_data(data)
     read = list(READERS[kind](path).scenes("train_val"))
     assert [(one.name, len(one.pairs)) for one in read] == [(one.name, len(one.pairs)) for one in RECORDS]

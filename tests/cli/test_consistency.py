@@ -1,4 +1,4 @@
-"""``cab-forecast consistency`` against the real server with a plane that says what the tests want."""
+"""``cab-forecast consistency`` against the real server with a fake consistency service."""
 
 import json
 import logging
@@ -40,7 +40,7 @@ COMMANDS: list[tuple[list[str], Message, Message]] = [
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """The server with its baselines; it logs nothing, as its output is the command's."""
+    """Serve the baselines without logging, because server and command share their output."""
     models = tmp_path_factory.mktemp("models")
     chosen = settings(models=models, api_tokens=(SecretStr("token"),))
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
@@ -51,7 +51,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 @pytest.fixture(autouse=True)
 def plane(server: Server, monkeypatch: pytest.MonkeyPatch) -> FakePlane:
-    """Its plane, where the command looks for it."""
+    """Replace the server's consistency service, and set the server as the command's default endpoint."""
     monkeypatch.setenv("CAB_FORECAST_ENDPOINT", f"grpc://{server.grpc_address}")
     monkeypatch.setenv("CAB_FORECAST_TOKEN", "token")
     return with_fake_plane(server)
@@ -83,8 +83,8 @@ def test_tables() -> None:
 
 
 def test_watch(plane: FakePlane, server: Server) -> None:
-    """In a process of its own, ended by Ctrl-C."""
-    # Whoever runs the tests in the background has Ctrl-C ignored, and so would this
+    """The command runs in its own process, which Ctrl-C ends."""
+    # A shell that runs the tests in the background ignores SIGINT, which this process would inherit
     heed = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
     program = f"{heed}; from cli.main import app; app()"
     command = [sys.executable, "-c", program, "consistency", "watch", "s"]
@@ -107,7 +107,7 @@ def test_watch(plane: FakePlane, server: Server) -> None:
                 process.send_signal(signal.SIGINT)
                 assert process.wait(10) == 0
             finally:
-                process.kill()  # or a failure would wait for it for ever
+                process.kill()  # otherwise a failure would hang
         plane.wait(0)
 
 

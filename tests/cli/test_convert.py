@@ -12,7 +12,7 @@ from model.convert import UnsafePickleError
 
 
 def run(*arguments: str) -> tuple[int, str, str]:
-    """Exit code, standard output, standard error."""
+    """Return the exit code, standard output and standard error."""
     result = CliRunner().invoke(app, ["convert", *arguments])
     return result.exit_code, result.stdout, result.stderr
 

@@ -1,4 +1,4 @@
-"""``cab-forecast evaluate`` on scenes that are made up here."""
+"""``cab-forecast evaluate`` on made-up scenes."""
 
 import json
 from pathlib import Path
@@ -16,14 +16,14 @@ PAIRS = len(record().pairs)
 
 @pytest.fixture(autouse=True)
 def made(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Data of the kind "made", with the split "some"."""
+    """Provide data of the kind "made" with the split "some"."""
     monkeypatch.setitem(READERS, "made", lambda path: FixedReader(record()))
 
 
 def evaluate(
     folder: Path, *arguments: str, data: str = "made:DIR", split: str = "some"
 ) -> tuple[int, str, str]:
-    """Exit code, standard output, and standard error in one line."""
+    """Return the exit code, standard output, and standard error on one line."""
     result = CliRunner().invoke(
         app, ["evaluate", "--data", data, "--split", split, "--out", str(folder / "out"), *arguments]
     )
@@ -47,7 +47,7 @@ def test_all_models_are_judged_written_and_shown(tmp_path: Path) -> None:
     for word in ("causal protocol", "split some", f"{PAIRS} pairs", "5 sampled", "context matter"):
         assert word in tables
         assert word in shown
-    # Again, from the cache that is there by now: to the last bit the same
+    # Again, from the cache: bit-equal
     assert evaluate(tmp_path, *arguments)[0] == 0
     assert (tmp_path / "out/results.json").read_text() == text
 

@@ -1,4 +1,4 @@
-"""``cab-forecast predict`` against the fakes of the server's side."""
+"""``cab-forecast predict`` against a fake server."""
 
 import json
 import sys
@@ -20,13 +20,13 @@ run = CliRunner().invoke
 
 @pytest.fixture
 def script() -> Script:
-    """What the server does."""
+    """Return the fake server's script."""
     return Script()
 
 
 @pytest.fixture(autouse=True)
 def server(script: Script, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """A server where the command looks for one."""
+    """Run a fake server at the command's default endpoint."""
     with grpc_fake(script) as address:
         monkeypatch.setenv("CAB_FORECAST_ENDPOINT", f"grpc://{address}")
         yield
@@ -120,7 +120,7 @@ def test_a_missing_matplotlib_is_found_before_the_call(
 
 
 def fails_with_one_line(*arguments: str) -> str:
-    """The one line on standard error of a command that fails."""
+    """Return the single line on standard error of a failing command."""
     result = run(app, ["predict", *arguments])
     assert result.exit_code == 1
     assert not result.stdout

@@ -1,4 +1,4 @@
-"""``cab-forecast train`` on a scene that is made up here."""
+"""``cab-forecast train`` on a made-up scene."""
 
 import json
 from pathlib import Path
@@ -17,13 +17,13 @@ from tests.model.training.fakes import small_config
 
 @pytest.fixture(autouse=True)
 def made(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Data of the kind "made", with the split "some"."""
+    """Provide data of the kind "made" with the split "some"."""
     monkeypatch.setitem(READERS, "made", lambda path: FixedReader(record()))
 
 
 @pytest.fixture
 def settings(tmp_path: Path) -> Path:
-    """Of a small network, with a table of what is published."""
+    """Write the settings of a small network, with a table of published values."""
     file = tmp_path / "settings.toml"
     text = small_config(Method.TRAJECTRON, epochs=1, displacement_weight=1.0).toml()
     file.write_text(f"{text}\n[published]\nlearning_rate = 0.0025\nbatch_size = 8\nepochs = 1\n")
@@ -31,7 +31,7 @@ def settings(tmp_path: Path) -> Path:
 
 
 def train(folder: Path, method: str, *arguments: str, data: str = "made:DIR") -> tuple[int, str, str]:
-    """Exit code, standard output, and standard error in one line."""
+    """Return the exit code, standard output, and standard error on one line."""
     splits = ("--train-split", "some", "--validation-split", "some")
     result = CliRunner().invoke(
         app, ["train", method, "--data", data, "--out", str(folder / "out"), *splits, *arguments]
@@ -40,7 +40,7 @@ def train(folder: Path, method: str, *arguments: str, data: str = "made:DIR") ->
 
 
 def state(folder: Path) -> dict[str, Any]:
-    """Settings and progress of a run."""
+    """Read the settings and progress of a run."""
     read: dict[str, Any] = json.loads((folder / "out/state.json").read_text())
     return read
 
@@ -52,7 +52,7 @@ def test_a_run_its_checkpoint_and_one_that_begins_with_it(tmp_path: Path, settin
     assert str(folder) in "".join((shown + said).split())
     assert load_checkpoint(folder).info.full_name == "trajectron@1.2.3"
     assert state(tmp_path)["config"]["displacement_weight"] == 1
-    # More epochs: it goes on
+    # More epochs: the run resumes
     code, _, said = train(tmp_path, "trajectron", "--config", str(settings), "--epochs", "2")
     assert code == 0, said
     assert state(tmp_path)["progress"]["epoch"] == 2

@@ -1,4 +1,4 @@
-"""What the tests of deploy/ share."""
+"""Fixtures of the tests of deploy/."""
 
 import asyncio
 
@@ -11,7 +11,7 @@ from tests.deploy.series import Series, exported
 
 @pytest.fixture(scope="session")
 def series() -> Series:
-    """All that queries can ask for: what servers export, and what the rules make of it."""
+    """Return all series that queries can select: exported by servers or recorded by rules."""
     known = asyncio.run(exported())
     known["up"] = {"job": {job_name()}, "instance": set()}
     for rule in [*rules("benchmark.yml"), *rules("alerts.yml")]:

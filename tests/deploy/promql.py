@@ -1,4 +1,4 @@
-"""Checks of PromQL against the series that there are."""
+"""Checks of PromQL expressions against the existing series."""
 
 import promql_parser as promql
 
@@ -8,19 +8,19 @@ _NONE: Labels = {}
 
 
 class QueryError(ValueError):
-    """A query asks for something that there is not."""
+    """A query selects a metric, label or value that does not exist."""
 
 
 def labels_of(query: str, series: Series) -> Labels:
-    """Labels of what a query gives, with the values that they can have.
+    """Return the labels of a query's result, with their possible values.
 
     Args:
         query: PromQL.
-        series: all that can be asked for.
+        series: all existing series.
 
     Raises:
-        QueryError: it asks for another metric, label or value.
-        ValueError: it cannot be parsed.
+        QueryError: the query selects another metric, label or value.
+        ValueError: the query cannot be parsed.
     """
     return _labels(promql.parse(query), series)
 

@@ -1,4 +1,4 @@
-"""What a running server exports: names, labels and their values."""
+"""The metrics that a running server exports: names, labels and label values."""
 
 import re
 from collections.abc import Mapping
@@ -18,9 +18,9 @@ from tests.service.tracking.store.stores import scene_name
 from tests.service.tracks import made_up
 
 Labels = dict[str, set[str]]
-"""Values that each label is known to have."""
+"""The values of each label."""
 Series = Mapping[str, Labels]
-"""Labels of each metric, by the name that a query asks for."""
+"""The labels of each series, by name."""
 
 _PATIENT = {"store_budget_ms": 5000.0, "store_timeout_ms": 5000.0}
 _NOWHERE = "redis://127.0.0.1:1"
@@ -28,9 +28,9 @@ _MODEL = "fake"
 
 
 async def exported() -> dict[str, Labels]:
-    """All series of two servers: one whose agents were forecast until sets settled, one without its memory.
+    """Return all series of two servers: one that forecast agents until sets settled, one without a store.
 
-    The values of labels that tell of failures are all that there may be.
+    Labels that name failures have all their possible values.
     """
     found: dict[str, Labels] = {}
     tracks = made_up(scene_name(), agents=2)
@@ -51,7 +51,7 @@ async def exported() -> dict[str, Labels]:
 
 
 def _off_the_road() -> pb.PredictRequest:
-    """An agent that drives, on a map without a road."""
+    """Return a request with a driving agent on a map without a road."""
     request = make_request(1, _MODEL)
     request.scene_raster.CopyFrom(scene_raster(np.zeros((3, 300, 300), dtype=np.uint8), (-50.0, -50.0)))
     return request
@@ -60,13 +60,13 @@ def _off_the_road() -> pb.PredictRequest:
 def _add(found: dict[str, Labels], server: Server) -> None:
     for family in text_string_to_metric_families(server.metrics.render().decode()):
         for sample in family.samples:
-            labels = found.setdefault(sample.name, {"job": set(), "instance": set()})  # Prometheus adds these
+            labels = found.setdefault(sample.name, {"job": set(), "instance": set()})  # added by Prometheus
             for name, value in sample.labels.items():
                 labels.setdefault(name, set()).add(value)
 
 
 def is_known(value: str, labels: Labels, name: str) -> bool:
-    """Whether a label can have a value, or one of the values that a | b | c names."""
+    """Return whether a label can have a value, or each of the alternatives in a | b | c."""
     return not labels[name] or all(
         any(re.fullmatch(part, known) for known in labels[name]) for part in value.split("|")
     )

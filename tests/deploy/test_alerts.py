@@ -1,4 +1,4 @@
-"""The rules of Prometheus ask for nothing that the server does not export."""
+"""The Prometheus rules use only metrics that the server exports."""
 
 import json
 import re
@@ -11,7 +11,7 @@ from tests.deploy.series import Series
 
 ALERTS = {rule["alert"]: rule for rule in rules("alerts.yml") if "alert" in rule}
 _NO_MEANING = {"le"}
-"""Labels whose values are numbers that Prometheus 2 and 3 write differently."""
+"""Labels whose values are numbers, which Prometheus 2 and 3 format differently."""
 
 
 def test_all_rule_files_are_loaded() -> None:

@@ -1,4 +1,4 @@
-"""docker-compose.yml and the manifests say what the server understands."""
+"""docker-compose.yml and the Kubernetes manifests fit the server's settings."""
 
 import re
 from typing import Any
@@ -21,18 +21,18 @@ POD = DEPLOYMENT["spec"]["template"]["spec"]
 
 
 def image_environment() -> dict[str, str]:
-    """What the Dockerfile sets."""
+    """Return the settings in the Dockerfile."""
     return dict(re.findall(rf"\b({PREFIX}\w+)=(\S+)", (ROOT / "Dockerfile").read_text()))
 
 
 def image_ports() -> set[int]:
-    """What the Dockerfile exposes."""
+    """Return the ports that the Dockerfile exposes."""
     [ports] = re.findall(r"^EXPOSE (.*)$", (ROOT / "Dockerfile").read_text(), re.MULTILINE)
     return {int(port) for port in ports.split()}
 
 
 def settings_of(monkeypatch: pytest.MonkeyPatch, environment: dict[str, str]) -> Settings:
-    """What the server makes of an environment of strings."""
+    """Return the server's settings for the image's environment and another one."""
     assert all(isinstance(value, str) for value in environment.values())
     for name, value in (image_environment() | environment).items():
         monkeypatch.setenv(name, value)
@@ -78,7 +78,7 @@ def test_prometheus_finds_its_files_and_the_server() -> None:
 
 
 async def test_redis_understands_its_options_and_all_that_is_in_it_expires() -> None:
-    """Which is what it is told to make room by."""
+    """The eviction policy volatile-ttl needs an expiry on every key."""
     program, *options = SERVICES["redis"]["command"]
     assert program == "redis-server"
     scene = scene_name()

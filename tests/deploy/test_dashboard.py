@@ -1,4 +1,4 @@
-"""The dashboard of Grafana asks for nothing that the server does not export."""
+"""The Grafana dashboard uses only metrics that the server exports."""
 
 import json
 import re
@@ -16,7 +16,7 @@ PANELS = [panel for panel in DASHBOARD["panels"] if panel["type"] != "row"]
 
 
 def query_of(target: dict[str, str]) -> str:
-    """PromQL, with durations where Grafana puts them in."""
+    """Return the PromQL of a target, with a duration in place of Grafana's interval variables."""
     return re.sub(r"\[\$\w+\]", "[5m]", target["expr"])
 
 

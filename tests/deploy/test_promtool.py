@@ -1,4 +1,4 @@
-"""The rules, by Prometheus's own tool where it is installed."""
+"""Checks of the rules by promtool, where it is installed."""
 
 import shutil
 import subprocess
