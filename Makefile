@@ -52,7 +52,7 @@ bench: install  ## measure the forward pass (relative to matmul), startup time, 
 	$(BIN)/python -m loadtest.tracking
 
 faults: install  ## forecast while the track memory is killed, full, slow or hanging; needs redis-server
-	$(BIN)/python -m loadtest.faults
+	$(BIN)/python -m loadtest.redis_faults
 
 docs: install  ## generate the tables of settings and metrics in docs/
 	$(BIN)/python -m docs.generate

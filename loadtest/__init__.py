@@ -1,1 +1,1 @@
-"""Loads and measurements of a server that runs as users run it."""
+"""Load tests and measurements of servers that run as users run them."""

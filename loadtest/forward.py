@@ -1,6 +1,6 @@
-"""How fast the forward is, against what this process's matrix products reach: ``make bench``.
+"""Speed of the forward pass, relative to this process's matrix products: ``make bench``.
 
-Rates and times are of one process in one run; on a busy machine only their ratio means much.
+The times are from one process in one run. On a busy machine only the ratio is meaningful.
 """
 
 import platform
@@ -22,22 +22,22 @@ from model.scenes.scene import AgentType
 
 AGENTS = (1, 8, 32, 128)
 FLOP_PER_AGENT = {Frame.GROUND: 42e6, Frame.AGENT: 25e6}
-"""Multiplications and additions of the full forward, K = 25, T = 12: of the published network with its GRU
-unrolled (REFERENCE, section 2), and of the one in the agent's frame."""
+"""Multiplications and additions of the full forward pass, K = 25, T = 12: of the published network with its
+GRU unrolled (REFERENCE, section 2), and of the network in the agent's frame."""
 HISTORY_FRAMES = 5
 _SECONDS_EACH = 2.0
-_LEAST_CALLS = 11
+_MIN_CALLS = 11
 _MATRIX = 1024
 
 
 def paired_seconds(*calls: Callable[[], object], seconds: float = _SECONDS_EACH) -> list[float]:
-    """Median time of each call, taken in turns over ``seconds``, after a warm-up of a tenth of that.
+    """Return the median time of each call after a warm-up of a tenth of ``seconds``.
 
-    In turns, so that what else the machine does meets them alike and their ratio holds.
+    The calls alternate, so that other load on the machine affects them equally and their ratio holds.
     """
     times: list[list[float]] = [[] for _ in calls]
     begin = time.perf_counter()
-    while time.perf_counter() < begin + 1.1 * seconds or len(times[0]) < _LEAST_CALLS:
+    while time.perf_counter() < begin + 1.1 * seconds or len(times[0]) < _MIN_CALLS:
         for call, own in zip(calls, times, strict=True):
             start = time.perf_counter()
             call()
@@ -46,7 +46,7 @@ def paired_seconds(*calls: Callable[[], object], seconds: float = _SECONDS_EACH)
 
 
 def cab_network(frame: Frame = Frame.GROUND) -> CvaeForecaster:
-    """Return a CAB network for vehicles with seeded random weights: speed does not hang on their values."""
+    """Return a CAB network for vehicles with seeded random weights; the speed does not depend on them."""
     torch.manual_seed(0)
     config = NetworkConfig(blind=BlindContext.NULL, frame=frame, far_map=frame is Frame.AGENT)
     info = ModelInfo(
@@ -67,7 +67,7 @@ def cab_network(frame: Frame = Frame.GROUND) -> CvaeForecaster:
 
 
 def features(agents: int) -> Features:
-    """Random features of that many vehicles."""
+    """Return random features of that many vehicles for a network in the ground frame."""
     generator = torch.Generator().manual_seed(agents)
 
     def normal(*shape: int) -> torch.Tensor:
@@ -107,7 +107,7 @@ def features_in_agent_frame(agents: int) -> Features:
 
 
 def main() -> None:
-    """Print the table: both networks in turns, so that what else the machine does meets them alike."""
+    """Print the table; both networks alternate, so that other load on the machine affects them equally."""
     models = {frame: cab_network(frame) for frame in Frame}
     model = models[Frame.GROUND]
     left, right = torch.randn(_MATRIX, _MATRIX), torch.randn(_MATRIX, _MATRIX)

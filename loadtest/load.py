@@ -1,4 +1,4 @@
-"""Calls at a steady rate, whatever becomes of the ones before."""
+"""Calls at a steady rate, independent of the results of earlier calls."""
 
 import asyncio
 import time
@@ -17,11 +17,12 @@ class Call(NamedTuple):
     """One call."""
 
     sent: float
-    """On the clock of ``time.perf_counter``, s."""
+    """Start on the clock of ``time.perf_counter``, s."""
     seconds: float
+    """Latency."""
     scene: int
     failure: str
-    """What became of its forecasts; empty: all are there."""
+    """Failure of the forecasts; empty: all were made."""
     tracking: Tracking
 
 
@@ -30,11 +31,11 @@ class SteadyLoad:
     """Calls of several scenes in turn, in real time.
 
     Args:
-        client: by which they go; it should not try again.
-        model: that is asked for.
-        rate: calls/s, of all scenes together.
-        scenes: how many.
-        agents: of each.
+        client: client without retries.
+        model: requested model.
+        rate: calls/s of all scenes together.
+        scenes: number of scenes.
+        agents: agents per scene.
     """
 
     client: AsyncClient
@@ -43,10 +44,10 @@ class SteadyLoad:
     scenes: int
     agents: int
     calls: list[Call] = field(default_factory=list)
-    """Those that have ended, in that order."""
+    """Finished calls, in the order of their ends."""
 
     async def run(self, stop: asyncio.Event) -> None:
-        """Calls until told to stop, and waits for the last answers."""
+        """Call until the event is set, then wait for the last responses."""
         traffic = [Traffic(self.agents, seed) for seed in range(self.scenes)]
         begin, number = time.perf_counter(), 0
         async with asyncio.TaskGroup() as group:
@@ -60,14 +61,14 @@ class SteadyLoad:
         request = predict_request(
             now, traffic.agents(now, _STATES), scene_id=f"scene-{scene}", model=self.model, merge=False
         )
-        sent, told, failure = time.perf_counter(), Tracking.UNSPECIFIED, ""
+        sent, status, failure = time.perf_counter(), Tracking.UNSPECIFIED, ""
         try:
             response = await self.client.predict(request)
         except ForecastError as error:
             failure = f"{error.code}: {error}"
         else:
-            told = tracking(response)
+            status = tracking(response)
             made = [forecast.status for forecast in forecasts(response).values()]
-            if len(made) < self.agents or any(status not in _FORECAST for status in made):
+            if len(made) < self.agents or any(forecast not in _FORECAST for forecast in made):
                 failure = f"forecasts: {', '.join(made)}"
-        self.calls.append(Call(sent, time.perf_counter() - sent, scene, failure, told))
+        self.calls.append(Call(sent, time.perf_counter() - sent, scene, failure, status))

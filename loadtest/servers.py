@@ -1,4 +1,4 @@
-"""Servers of one's own to measure: each a process on free ports, ended at the end."""
+"""Servers for measurements, each a process of its own on free ports."""
 
 import json
 import os
@@ -18,32 +18,32 @@ _SETTING = "FORECAST_"
 
 @dataclass(frozen=True)
 class Server:
-    """A ``cab-forecast serve`` that is ready."""
+    """Server process that is ready."""
 
     http: str
     """HOST:PORT of REST."""
     grpc: str
     """HOST:PORT of gRPC."""
     seconds: float
-    """From the process's start to its being ready."""
+    """Seconds from the start of the process until it was ready."""
     process: "subprocess.Popen[bytes]"
     log: Path
 
     def errors(self) -> list[str]:
-        """What it has logged as an error."""
+        """Return the events that the server has logged as errors."""
         return [event["event"] for event in _events(self.log) if event["level"] in ("error", "critical")]
 
 
 @contextmanager
 def serving(models: Path, **settings: object) -> Iterator[Server]:
-    """A server; nothing of this process's own settings goes to it.
+    """Run a server; settings in this process's environment do not reach it.
 
     Args:
-        models: folder of its checkpoints; an empty one leaves the baselines.
-        settings: of ``service.settings.Settings``.
+        models: folder of its checkpoints; if it is empty, the server has the baselines only.
+        settings: settings of ``service.settings.Settings``.
 
     Raises:
-        RuntimeError: it did not start.
+        RuntimeError: the server did not start.
     """
     environment = {name: value for name, value in os.environ.items() if not name.startswith(_SETTING)}
     environment |= {_SETTING + name.upper(): str(value) for name, value in settings.items()}
@@ -51,7 +51,7 @@ def serving(models: Path, **settings: object) -> Iterator[Server]:
     command = [sys.executable, "-m", "service", "serve", "--models", str(models), "--log-json", *ports]
     with tempfile.TemporaryDirectory(prefix="loadtest-") as folder:
         log = Path(folder) / "log"
-        with log.open("wb") as output:  # a file, as a pipe that nobody reads fills up
+        with log.open("wb") as output:  # a file: a pipe that nobody reads would fill up
             begin = time.perf_counter()
             process = subprocess.Popen(command, env=environment, stderr=subprocess.STDOUT, stdout=output)  # noqa: S603
         try:
@@ -67,7 +67,7 @@ def serving(models: Path, **settings: object) -> Iterator[Server]:
 
 
 def random_checkpoint(folder: Path) -> None:
-    """A CAB checkpoint of the full size."""
+    """Save a full-size CAB checkpoint with random weights."""
     from loadtest.forward import cab_network  # noqa: PLC0415 (torch is slow to import)
     from model.checkpoint import save_checkpoint  # noqa: PLC0415
 
@@ -78,7 +78,7 @@ def random_checkpoint(folder: Path) -> None:
 
 
 def _until_ready(process: "subprocess.Popen[bytes]", log: Path, give_up: float) -> dict[str, str]:
-    """What the server says when it is ready."""
+    """Return the server's "ready" event."""
     while process.poll() is None and time.perf_counter() < give_up:
         for event in _events(log):
             if event["event"] == "ready":
@@ -88,6 +88,6 @@ def _until_ready(process: "subprocess.Popen[bytes]", log: Path, give_up: float) 
 
 
 def _events(log: Path) -> list[dict[str, str]]:
-    """What is in a log, but for a line that is not whole yet and what other libraries write."""
+    """Return the JSON events of a log, without a last line that is still incomplete."""
     lines = log.read_text().splitlines(keepends=True)
     return [json.loads(line) for line in lines if line.startswith("{") and line.endswith("\n")]

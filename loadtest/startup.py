@@ -1,7 +1,7 @@
-"""From process start to ready, and the memory it then holds: ``python -m loadtest.startup``.
+"""Time from process start to ready, and resident memory: ``python -m loadtest.startup``.
 
-The server has one learned model, a CAB network of seeded random weights unless a folder of checkpoints
-is given; it runs the demo request before its memory is read.
+The server has one learned model: a CAB network with seeded random weights, unless a folder of checkpoints is
+given. It answers the demo request before its memory is measured.
 """
 
 import tempfile
@@ -22,13 +22,13 @@ class Start(NamedTuple):
     """One start."""
 
     seconds: float
-    """From the process's start to its being ready."""
+    """Seconds from the start of the process until it was ready."""
     resident: int
-    """Bytes, after one forecast."""
+    """Resident memory after one forecast, bytes."""
 
 
 def start_once(models: Path) -> Start:
-    """Starts a server on free ports, calls it once and ends it."""
+    """Start a server on free ports, call it once and stop it."""
     with serving(models) as server:
         with Client(f"grpc://{server.grpc}") as client:
             client.predict(demo_request())
@@ -39,7 +39,7 @@ def main(
     models: Annotated[Path | None, typer.Option(help="folder of checkpoints; default: a random CAB")] = None,
     repeats: Annotated[int, typer.Option(min=1)] = 5,
 ) -> None:
-    """Prints the medians; the first start, which warms the disk, is left out."""
+    """Print the medians, without the first start, which fills the disk cache."""
     with tempfile.TemporaryDirectory() as scratch:
         if models is None:
             random_checkpoint(Path(scratch))

@@ -1,4 +1,4 @@
-"""Servers with each kind of track memory, to be compared."""
+"""Servers with each kind of track memory, for comparison."""
 
 import shutil
 from collections.abc import Iterator
@@ -11,42 +11,46 @@ import redis
 import typer
 
 from cab_forecast import Client
+from loadtest import redis_servers
+from loadtest.redis_servers import HOST, Process
 from loadtest.servers import serving
-from tests.service.tracking.store import redis_servers
-from tests.service.tracking.store.redis_servers import HOST, Process
 
 _EXPIRY = 3600
-"""s; longer than anything here takes."""
-_AGENTS = 50_000
-"""More than there are here."""
+"""Seconds; longer than any measurement."""
+_MAX_AGENTS = 50_000
+"""More than any measurement has."""
 
 
 @dataclass(frozen=True)
 class Store:
-    """A server, a client of it, and the Redis that is its track memory."""
+    """A server, its client, and the Redis of its track memory."""
 
     name: str
     client: Client
     process: psutil.Process
-    """Of the server."""
+    """Process of the server."""
     redis: Process | None
-    """None: the server remembers by itself."""
+    """None: the track memory is in-process."""
 
     def resident(self) -> int:
-        """Bytes that the server takes."""
+        """Return the resident memory of the server, bytes."""
         resident: int = self.process.memory_info().rss
         return resident
 
     def round_trips(self) -> int:
-        """Scripts that Redis was asked for so far; 0 without it."""
+        """Return the number of scripts that Redis has run; 0 without Redis."""
         if self.redis is None:
             return 0
         stats = self.redis.text("INFO commandstats").splitlines()
-        asked = [line for line in stats if line.startswith(("cmdstat_evalsha:", "cmdstat_eval:"))]
-        return sum(int(line.partition("calls=")[2].partition(",")[0]) for line in asked)
+        scripts = [line for line in stats if line.startswith(("cmdstat_evalsha:", "cmdstat_eval:"))]
+        return sum(int(line.partition("calls=")[2].partition(",")[0]) for line in scripts)
 
-    def held(self, scene_ids: str) -> int:
-        """Bytes that Redis takes for scenes, by how their ids begin; 0 without it."""
+    def redis_bytes(self, scene_ids: str) -> int:
+        """Return the memory of scenes in Redis, bytes; 0 without Redis.
+
+        Args:
+            scene_ids: prefix of the scene ids.
+        """
         if self.redis is None:
             return 0
         with redis.Redis(HOST, self.redis.port) as client:
@@ -56,10 +60,10 @@ class Store:
 
 @contextmanager
 def redis_server() -> Iterator[Process]:
-    """A Redis on a free port, ended at the end.
+    """Run a Redis on a free port.
 
     Raises:
-        typer.Exit: none is installed.
+        typer.Exit: Redis is not installed.
     """
     if shutil.which("redis-server") is None:
         typer.echo("redis-server is not installed", err=True)
@@ -70,19 +74,19 @@ def redis_server() -> Iterator[Process]:
 
 @contextmanager
 def stores(models: Path) -> Iterator[list[Store]]:
-    """A server that remembers by itself, and one with a Redis.
+    """Run a server with in-process track memory, and one with Redis.
 
     Args:
-        models: folder of their checkpoints; an empty one leaves the baselines.
+        models: folder of their checkpoints; if it is empty, they have the baselines only.
     """
     with ExitStack() as stack:
         server = stack.enter_context(redis_server())
-        found = []
+        started = []
         for name, redis_process in (("in-process", None), ("Redis", server)):
             url = "memory" if redis_process is None else redis_process.url
             process = stack.enter_context(
-                serving(models, store=url, track_expiry=_EXPIRY, max_tracked_agents=_AGENTS)
+                serving(models, store=url, track_expiry=_EXPIRY, max_tracked_agents=_MAX_AGENTS)
             )
             client = stack.enter_context(Client(f"grpc://{process.grpc}", timeout=30, retries=0))
-            found.append(Store(name, client, psutil.Process(process.process.pid), redis_process))
-        yield found
+            started.append(Store(name, client, psutil.Process(process.process.pid), redis_process))
+        yield started

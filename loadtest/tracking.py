@@ -1,8 +1,8 @@
-"""What the track memory costs: ``python -m loadtest.tracking``.
+"""Cost of the track memory in time and memory: ``python -m loadtest.tracking``.
 
-Two servers, one that remembers by itself and one with a Redis of its own, are called with and without a
-scene_id, in turns, so that what else the machine does meets both alike. Then other scenes are remembered,
-more and more of them; and what they take is weighed.
+Two servers, one with in-process track memory and one with a Redis of its own, are called with and without a
+scene_id, in random order, so that other load on the machine affects both equally. The calls are repeated
+while the track memory holds more and more other scenes. Finally the memory per agent is measured.
 """
 
 import tempfile
@@ -14,62 +14,62 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from loadtest.crowd import MODEL, SECONDS, Crowd
+from loadtest.background_scenes import MODEL, SECONDS, BackgroundScenes
+from loadtest.paired_latency import AGENTS, STATES, Latencies, PairedLatency, Variant
 from loadtest.servers import random_checkpoint
 from loadtest.stores import Store, stores
-from loadtest.turns import AGENTS, STATES, Times, Turn, Turns
 
-_ADDED_MS = 1.5
-_ROUND_TRIPS = 1
+_TARGET_ADDED_MS = 1.5
+_TARGET_ROUND_TRIPS = 1
 _RATES = (2.0, 10.0)
-"""Hz, at which agents are weighed."""
+"""Call rates at which the memory per agent is measured, Hz."""
 _HISTORY = {"tracked": "request", "recalled": "memory"}
 
 
-class Weight(NamedTuple):
-    """What an agent takes in one store."""
+class AgentMemory(NamedTuple):
+    """Memory per agent in one store."""
 
     store: str
     rate: float
-    """Hz, of its scene's calls."""
+    """Call rate of its scene, Hz."""
     redis: float
-    """Bytes in Redis; 0 without it."""
+    """Bytes in Redis; 0 without Redis."""
     process: float
     """Bytes in the server."""
 
 
-def weigh(store: Store, rate: float, agents: int) -> Weight:
-    """What agents take that were called for longer than they are remembered.
+def memory_per_agent(store: Store, rate: float, agents: int) -> AgentMemory:
+    """Return the memory per agent once the window of the track memory is full.
 
     Args:
-        store: whose.
-        rate: Hz.
-        agents: how many to weigh; the more, the better.
+        store: the server.
+        rate: calls per scene, Hz.
+        agents: number of agents; more give a better estimate.
     """
-    # The same calls without a scene first: what the process takes for them is not the memory's
-    Crowd(store, "", tracked=False).grow(agents, rate)
-    crowd = Crowd(store, f"weighed-at-{rate:g}-hz")
+    # First the same calls without a scene_id: what the process allocates for them is not track memory
+    BackgroundScenes(store, "", tracked=False).grow(agents, rate)
+    scenes = BackgroundScenes(store, f"weighed-at-{rate:g}-hz")
     before = store.resident()
-    crowd.grow(agents, rate)
+    scenes.grow(agents, rate)
     process = store.resident() - before
-    return Weight(store.name, rate, store.held(crowd.name) / agents, process / agents)
+    return AgentMemory(store.name, rate, store.redis_bytes(scenes.name) / agents, process / agents)
 
 
-def latency(servers: list[Store], models: Sequence[str], rounds: int) -> Table:
-    """What tracking adds to a call.
+def latency_table(servers: list[Store], models: Sequence[str], rounds: int) -> Table:
+    """Return a table of the latency that tracking adds to a call.
 
     Args:
-        servers: to be compared.
-        models: to be called.
-        rounds: calls of each kind.
+        servers: servers to compare.
+        models: models to request.
+        rounds: calls per variant.
     """
     table = Table(
         title=f"calls of {AGENTS} vehicles with {STATES} states each, 2 Hz; target: "
-        f"p50 + {_ADDED_MS} ms, {_ROUND_TRIPS} round trip"
+        f"p50 + {_TARGET_ADDED_MS} ms, {_TARGET_ROUND_TRIPS} round trip"
     )
     for heading in ("model", "store", "history from"):
         table.add_column(heading)
-    for heading in ("untracked p50", "p90, ms", "added p50, ms", "p90, ms", "round trips", "unanswered"):
+    for heading in ("untracked p50", "p90, ms", "added p50, ms", "p90, ms", "round trips", "unavailable"):
         table.add_column(heading, justify="right")
     for model in models:
         _add_model(table, servers, model, rounds)
@@ -77,98 +77,101 @@ def latency(servers: list[Store], models: Sequence[str], rounds: int) -> Table:
 
 
 def _add_model(table: Table, servers: list[Store], model: str, rounds: int) -> None:
-    turns = Turns(servers, ("untracked", "tracked", "recalled"), model)
-    times, trips = turns.measure(rounds), turns.round_trips()
-    turns.forget()
-    for turn, own in times.items():
-        if turn.way == "untracked":
+    pairs = PairedLatency(servers, ("untracked", "tracked", "recalled"), model)
+    latencies, trips = pairs.measure(rounds), pairs.round_trips()
+    pairs.reset()
+    for variant, own in latencies.items():
+        if variant.mode == "untracked":
             continue
-        without = times[Turn(turn.store, "untracked")]
+        baseline = latencies[Variant(variant.store, "untracked")]
         table.add_row(
             model,
-            turn.store,
-            _HISTORY[turn.way],
-            *(f"{without.quantile_ms(share):.2f}" for share in (0.5, 0.9)),
-            *_added(own, without),
-            f"{trips[turn]:g}",
+            variant.store,
+            _HISTORY[variant.mode],
+            *(f"{baseline.quantile_ms(share):.2f}" for share in (0.5, 0.9)),
+            *_added(own, baseline),
+            f"{trips[variant]:g}",
             f"{own.unavailable} of {rounds}",
         )
 
 
-def _added(times: Times, without: Times) -> list[str]:
-    """To the median, with its 95 % interval, and to the 90th percentile."""
-    added = times.added(without)
+def _added(latencies: Latencies, baseline: Latencies) -> list[str]:
+    """Return the latency added to the median, with its 95 % interval, and to the 90th percentile."""
+    added = latencies.added_to(baseline)
     return [
         f"{added.median:+.2f} ({added.low:.2f} … {added.high:.2f})",
-        f"{times.quantile_ms(0.9) - without.quantile_ms(0.9):+.2f}",
+        f"{latencies.quantile_ms(0.9) - baseline.quantile_ms(0.9):+.2f}",
     ]
 
 
-def flatness(servers: list[Store], live: Sequence[int], rounds: int) -> Table:
-    """What tracking adds to a call while agents of other scenes are remembered.
+def scaling_table(servers: list[Store], live: Sequence[int], rounds: int) -> Table:
+    """Return a table of the latency that tracking adds while the track memory holds other scenes.
 
     Args:
-        servers: to be compared.
-        live: how many agents.
-        rounds: calls of each kind, for each number of them.
+        servers: servers to compare.
+        live: numbers of agents in the other scenes.
+        rounds: calls per variant and number of agents.
     """
-    table = Table(title=f"the same calls, {MODEL}, while other scenes are remembered")
-    table.add_column("agents there", justify="right")
+    table = Table(title=f"the same calls, {MODEL}, with other scenes in the track memory")
+    table.add_column("other agents", justify="right")
     for store in servers:
-        for heading in (f"{store.name}, untracked p50", "added p50", "p90, ms", "unanswered"):
+        for heading in (f"{store.name}, untracked p50", "added p50", "p90, ms", "unavailable"):
             table.add_column(heading, justify="right")
-    crowds = [Crowd(store, "crowd") for store in servers]
-    turns = Turns(servers, ("untracked", "tracked"), MODEL)
+    background = [BackgroundScenes(store, "crowd") for store in servers]
+    pairs = PairedLatency(servers, ("untracked", "tracked"), MODEL)
     for agents in sorted(live):
-        for crowd in crowds:
-            crowd.grow(agents, 2.0)
-        times = turns.measure(rounds)
+        for scenes in background:
+            scenes.grow(agents, 2.0)
+        latencies = pairs.measure(rounds)
         cells = []
         for store in servers:
-            own, without = times[Turn(store.name, "tracked")], times[Turn(store.name, "untracked")]
+            own = latencies[Variant(store.name, "tracked")]
+            baseline = latencies[Variant(store.name, "untracked")]
             cells += [
-                f"{without.quantile_ms(0.5):.2f}",
-                *_added(own, without),
+                f"{baseline.quantile_ms(0.5):.2f}",
+                *_added(own, baseline),
                 f"{own.unavailable} of {rounds}",
             ]
         table.add_row(str(agents), *cells)
     return table
 
 
-def weights(servers: list[Store], agents: int) -> Table:
-    """What an agent takes.
+def memory_table(servers: list[Store], agents: int) -> Table:
+    """Return a table of the memory per agent.
 
     Args:
-        servers: to be compared.
-        agents: how many to weigh.
+        servers: servers to compare.
+        agents: number of agents to measure.
     """
-    table = Table(title=f"bytes of an agent after {SECONDS} s of calls")
+    table = Table(title=f"bytes per agent after {SECONDS} s of calls")
     for heading in ("store", "calls, Hz", "in Redis", "in the server"):
         table.add_column(heading, justify="left" if heading == "store" else "right")
     for store in servers:
         for rate in _RATES:
-            weight = weigh(store, rate, agents)
-            held = f"{weight.redis:,.0f}" if store.redis is not None else ""
-            table.add_row(store.name, f"{rate:g}", held, f"{weight.process:,.0f}")
+            memory = memory_per_agent(store, rate, agents)
+            in_redis = f"{memory.redis:,.0f}" if store.redis is not None else ""
+            table.add_row(store.name, f"{rate:g}", in_redis, f"{memory.process:,.0f}")
     return table
 
 
 def main(
-    model: Annotated[list[str] | None, typer.Option(help="to call; default: kalman and a random CAB")] = None,
-    rounds: Annotated[int, typer.Option(min=2, help="calls of each kind")] = 200,
+    model: Annotated[
+        list[str] | None, typer.Option(help="models to request; default: kalman and a random CAB")
+    ] = None,
+    rounds: Annotated[int, typer.Option(min=2, help="calls per variant")] = 200,
     live: Annotated[
         list[int] | None, typer.Option(min=1, help="agents in other scenes; default: 10 … 10,000")
     ] = None,
-    weighed: Annotated[int, typer.Option(min=1, help="agents to weigh")] = 400,
+    weighed: Annotated[int, typer.Option(min=1, help="agents for the memory per agent")] = 400,
 ) -> None:
-    """Prints three tables: time, time beside other scenes, and room."""
+    """Print three tables: added latency, added latency by other scenes, and memory per agent."""
     console = Console()
     with tempfile.TemporaryDirectory() as models:
         random_checkpoint(Path(models))
         with stores(Path(models)) as servers:
-            console.print(latency(servers, model or ("kalman", "cab"), rounds))
-            console.print(flatness(servers, live or [10, 100, 1000, 10_000], rounds))
-            console.print(weights(servers, weighed))
+            console.print(latency_table(servers, model or ("kalman", "cab"), rounds))
+            console.print(scaling_table(servers, live or [10, 100, 1000, 10_000], rounds))
+            console.print(memory_table(servers, weighed))
 
 
 if __name__ == "__main__":

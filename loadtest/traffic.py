@@ -1,4 +1,4 @@
-"""Made-up vehicles to forecast: each drives in a circle at a speed of its own."""
+"""Synthetic vehicles: each drives in a circle at its own speed."""
 
 import numpy as np
 
@@ -8,10 +8,10 @@ from cab_forecast import agent
 START = 1_700_000_000.0
 """s since the epoch."""
 STEP = 0.5
-"""s between observations of a history."""
+"""Seconds between the states of a history."""
 
 _FIELD = 400.0
-"""m, the side of the square that the circles are spread over."""
+"""Side of the square that the circles are spread over, m."""
 _SPEEDS = (3.0, 15.0)
 """m/s."""
 _RADII = (30.0, 200.0)
@@ -19,11 +19,11 @@ _RADII = (30.0, 200.0)
 
 
 class Traffic:
-    """Vehicles, the same for the same seed.
+    """Vehicles, reproducible by seed.
 
     Args:
-        count: how many.
-        seed: of where and how they drive.
+        count: number of vehicles.
+        seed: seed of their circles and speeds.
     """
 
     def __init__(self, count: int, seed: int = 0) -> None:
@@ -34,11 +34,11 @@ class Traffic:
         self._angles = random.uniform(0, 2 * np.pi, (count, 1))
 
     def agents(self, time: float, states: int) -> list[Agent]:
-        """All of them, at a time and ``STEP`` apart before it.
+        """Return all vehicles with their states up to a time, ``STEP`` apart.
 
         Args:
-            time: s since the epoch; not before ``START``.
-            states: observations of each.
+            time: seconds since the epoch; not before ``START``.
+            states: states per vehicle.
         """
         times = time - STEP * np.arange(states - 1, -1, -1)
         angles = self._angles + self._speeds / self._radii * (times - START)

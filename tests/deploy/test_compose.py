@@ -6,11 +6,11 @@ from typing import Any
 import pytest
 import yaml
 
+from loadtest.redis_servers import single
 from service.environment import PREFIX
 from service.settings import Settings, load, split_address
 from tests.deploy.files import DEPLOY, ROOT, job_name, read_yaml
-from tests.service.tracking.store.redis_servers import single
-from tests.service.tracking.store.stores import opened, scene_name
+from tests.service.tracking.store.stores import opened, require_redis, scene_name
 from tests.service.tracking.store.track_updates import START, track_update
 
 SERVICES: dict[str, Any] = read_yaml(ROOT / "docker-compose.yml")["services"]
@@ -82,6 +82,7 @@ async def test_redis_understands_its_options_and_all_that_is_in_it_expires() -> 
     program, *options = SERVICES["redis"]["command"]
     assert program == "redis-server"
     scene = scene_name()
+    require_redis()
     with single(*options) as redis:
         assert redis.command("CONFIG", "GET", "maxmemory-policy") == [b"maxmemory-policy", b"volatile-ttl"]
         assert redis.command("CONFIG", "GET", "maxmemory") == [b"maxmemory", b"%d" % (512 * 2**20)]

@@ -12,14 +12,14 @@ import pytest
 from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from cab_forecast import AsyncClient, BadRequest, Overloaded, TrackingUnavailable, UnknownTrack
+from loadtest.redis_servers import free_port, single
 from service.server import Server
 from service.tracking.store.factory import MAX_WATCHERS
 from tests.nuscenes_pred import real_tracks
 from tests.service.fakes import FakeForecaster
 from tests.service.processes import process, ready
 from tests.service.servers import running
-from tests.service.tracking.store.redis_servers import free_port, single
-from tests.service.tracking.store.stores import scene_name
+from tests.service.tracking.store.stores import require_redis, scene_name
 from tests.service.tracks import (
     Replayed,
     Track,
@@ -41,6 +41,7 @@ PATIENT = {"store_budget_ms": 5000.0, "store_timeout_ms": 5000.0}
 
 @pytest.fixture(scope="module")
 def redis_url() -> Iterator[str]:
+    require_redis()
     with single() as server:
         yield server.url
 

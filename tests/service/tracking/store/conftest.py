@@ -1,16 +1,18 @@
-"""Servers that the tests share; each starts when it is first asked for. Who breaks one has one of its own."""
+"""Redis servers shared by the tests; each starts at its first use. Tests that break one start their own."""
 
 from collections.abc import Iterator
 
 import pytest
 
-from tests.service.tracking.store import redis_servers
-from tests.service.tracking.store.redis_servers import Cluster, FaultProxy, Process, Sentinels
+from loadtest import redis_servers
+from loadtest.redis_servers import Cluster, FaultProxy, Process, Sentinels
+from tests.service.tracking.store.stores import require_redis
 
 
 @pytest.fixture(scope="session")
 def redis_server() -> Iterator[Process]:
     """One server."""
+    require_redis()
     with redis_servers.single() as server:
         yield server
 
@@ -18,6 +20,7 @@ def redis_server() -> Iterator[Process]:
 @pytest.fixture(scope="session")
 def redis_cluster() -> Iterator[Cluster]:
     """Three masters with a replica each."""
+    require_redis()
     with redis_servers.cluster() as cluster:
         yield cluster
 
@@ -25,6 +28,7 @@ def redis_cluster() -> Iterator[Cluster]:
 @pytest.fixture(scope="session")
 def redis_sentinels() -> Iterator[Sentinels]:
     """A master, its replica and three Sentinels."""
+    require_redis()
     with redis_servers.sentinels() as sentinels:
         yield sentinels
 

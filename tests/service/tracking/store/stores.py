@@ -1,8 +1,11 @@
 """Stores to test, on real servers."""
 
+import shutil
 import uuid
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+
+import pytest
 
 from service.redis_url import parse_address
 from service.tracking.store.base import TrackStore
@@ -12,6 +15,12 @@ from service.tracking.store.redis.store import RedisStore
 
 EXPIRY = 30.0
 MAX_AGENTS = 10_000
+
+
+def require_redis() -> None:
+    """Skip the test if Redis is not installed."""
+    if shutil.which("redis-server") is None:
+        pytest.skip("redis-server is not installed")
 
 
 @asynccontextmanager

@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 from redis import exceptions as redis_errors
 
+from loadtest.redis_servers import FaultProxy
 from service.redis_url import parse_address
 from service.tracking.store.base import StoreError
 from service.tracking.store.guard import CircuitBreaker, Guard
 from service.tracking.store.redis.connection import connect
-from tests.service.tracking.store.redis_servers import FaultProxy
 
 LONG = 30.0
 """s; a budget that is never used up."""

@@ -15,11 +15,11 @@ from redis import exceptions as redis_errors
 from redis.asyncio.cluster import ClusterNode
 from redis.asyncio.sentinel import SentinelConnectionPool
 
+from loadtest import redis_servers
+from loadtest.redis_servers import HOST, Cluster, FaultProxy, Process, Sentinels
 from service.redis_url import Endpoint, Layout, RedisAddress, parse_address
 from service.tracking.store.redis import cluster
 from service.tracking.store.redis.connection import CLIENT_NAME, connect
-from tests.service.tracking.store import redis_servers
-from tests.service.tracking.store.redis_servers import HOST, Cluster, FaultProxy, Process, Sentinels
 
 LAYOUTS = ("redis_server", "redis_sentinels", "redis_cluster")
 ECHO = "return ARGV[1]"
@@ -180,7 +180,7 @@ async def test_commands_wait_for_a_connection(request: pytest.FixtureRequest, la
         await asyncio.gather(*(echo(client, n) for n in range(20)))
         # A cluster's client asks for the topology over a connection of its own
         most = 3 if layout == "redis_cluster" else 2
-        assert max(proxy.most for proxy in proxies) <= most
+        assert max(proxy.max_connections for proxy in proxies) <= most
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

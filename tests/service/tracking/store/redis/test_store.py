@@ -9,11 +9,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from redis.exceptions import OutOfMemoryError
 
+from loadtest.redis_servers import Process, single
 from service.tracking.store.base import ExchangeResult, SceneStatus, TrackStatus, TrackStore
 from service.tracking.store.records import NEWLY, unpack_instants
 from service.tracking.store.redis.scripts import SceneKeys
 from service.tracking.store.redis.store import MAX_ENTRIES, RedisStore
-from tests.service.tracking.store.redis_servers import Process, single
 from tests.service.tracking.store.stores import memory, opened, scene_name
 from tests.service.tracking.store.track_updates import START, times, track_update
 

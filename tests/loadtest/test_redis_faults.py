@@ -6,9 +6,9 @@ from collections import Counter
 import pytest
 
 from cab_forecast import Tracking
-from loadtest import faults
-from loadtest.fault_report import Held, Outcome, Report
+from loadtest import redis_faults
 from loadtest.load import Call
+from loadtest.redis_faults import PhaseResult, Report, Resources
 
 _CONNECTIONS = 16
 """The server's setting."""
@@ -16,12 +16,12 @@ _CONNECTIONS = 16
 
 @pytest.mark.skipif(shutil.which("redis-server") is None, reason="redis-server is not installed")
 def test_no_forecast_fails_whatever_becomes_of_redis() -> None:
-    report = faults.run(seconds=6.0, rate=40.0, scenes=4, agents=8)
+    report = redis_faults.run(seconds=6.0, rate=40.0, scenes=4, agents=8)
 
     assert report.problems() == []
     assert not report.logged
-    phases = {outcome.name: outcome for outcome in report.outcomes}
-    assert all(outcome.calls for outcome in phases.values())
+    phases = {result.name: result for result in report.phases}
+    assert all(result.calls for result in phases.values())
 
     for name, reason in (
         ("killed", "refused"),
@@ -37,7 +37,7 @@ def test_no_forecast_fails_whatever_becomes_of_redis() -> None:
         assert not phases[name].statuses["NEW"], name
 
     # A machine that tests run on may be slow, but not by what Redis is waited for without a budget
-    added = [outcome.quantile_ms(0.9) - phases["healthy"].quantile_ms(0.9) for outcome in phases.values()]
+    added = [result.quantile_ms(0.9) - phases["healthy"].quantile_ms(0.9) for result in phases.values()]
     assert max(added) < 250
 
     assert report.after.connections <= _CONNECTIONS
@@ -47,13 +47,13 @@ def test_no_forecast_fails_whatever_becomes_of_redis() -> None:
 def test_what_must_not_be_is_told() -> None:
     fine = Call(0.0, 0.01, 0, "", Tracking.OK)
     failed = fine._replace(failure="UNAVAILABLE: gone", tracking=Tracking.UNSPECIFIED)
-    held = Held(connections=1, files=20, threads=10, resident=2**20)
-    outcomes = [
-        Outcome("healthy", True, [fine], Counter(), 0.1),
-        Outcome("killed", False, [fine, failed], Counter(refused=1), None),
-        Outcome("started empty", True, [fine], Counter(), None),
+    held = Resources(connections=1, files=20, threads=10, resident=2**20)
+    results = [
+        PhaseResult("healthy", True, [fine], Counter(), 0.1),
+        PhaseResult("killed", False, [fine, failed], Counter(refused=1), None),
+        PhaseResult("started empty", True, [fine], Counter(), None),
     ]
-    assert Report(outcomes, held, held, []).problems() == [
+    assert Report(results, held, held, []).problems() == [
         "killed: 1 forecasts failed: UNAVAILABLE: gone",
-        "started empty: tracking did not come back",
+        "started empty: tracking did not recover",
     ]

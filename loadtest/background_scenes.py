@@ -1,4 +1,4 @@
-"""Scenes that a server remembers, many at a time."""
+"""Scenes that fill a server's track memory while other calls are measured."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -8,55 +8,53 @@ from loadtest.traffic import START, Traffic
 
 MODEL = "kalman"
 SECONDS = 11.5
-"""Of each scene's time: a little more than is remembered."""
+"""Duration of each scene: a little longer than the window of the track memory."""
 _SCENE_AGENTS = 40
-_CALLS = 4
-"""At a time."""
+_CONCURRENT_CALLS = 4
 
 
-class Crowd:
-    """Scenes of a server, each with a few agents, that are remembered whole.
+class BackgroundScenes:
+    """Scenes of one server, each with a few agents whose whole window is in the track memory.
 
     Args:
         store: the server.
-        name: begins the ids of its scenes.
-        tracked: False: the same calls, but nothing is remembered.
+        name: prefix of the scene ids.
+        tracked: False: the same calls without track memory.
     """
 
     def __init__(self, store: Store, name: str, tracked: bool = True) -> None:
         self.agents = 0
-        """Of all scenes."""
+        """Number of agents of all scenes."""
         self.name = name
         self._store = store
         self._tracked = tracked
         self._scenes = 0
 
     def grow(self, agents: int, rate: float) -> None:
-        """Adds agents, in scenes of their own.
+        """Add agents in new scenes.
 
         Args:
-            agents: how many there are in the end.
-            rate: calls of each scene, Hz.
+            agents: total number of agents afterwards.
+            rate: calls per scene, Hz.
         """
-        sizes = [min(_SCENE_AGENTS, agents - begun) for begun in range(self.agents, agents, _SCENE_AGENTS)]
+        sizes = [min(_SCENE_AGENTS, agents - first) for first in range(self.agents, agents, _SCENE_AGENTS)]
         numbers = range(self._scenes, self._scenes + len(sizes))
         traffic = [Traffic(size, number) for size, number in zip(sizes, numbers, strict=True)]
-        with ThreadPoolExecutor(_CALLS) as pool:
+        with ThreadPoolExecutor(_CONCURRENT_CALLS) as pool:
             for frame in range(round(SECONDS * rate)):
                 times = [START + frame / rate] * len(sizes)
-                list(
-                    pool.map(self._call, times, numbers, traffic)
-                )  # to its end: a scene's calls stay in order
+                # Each frame ends before the next: the calls of a scene stay in order
+                list(pool.map(self._call, times, numbers, traffic))
         self.agents, self._scenes = max(agents, self.agents), numbers.stop
 
-    def _id(self, number: int) -> str:
+    def _scene_id(self, number: int) -> str:
         return f"{self.name}-{number}"
 
     def _call(self, now: float, number: int, traffic: Traffic) -> None:
         request = predict_request(
             now,
             traffic.agents(now, 1),
-            scene_id=self._id(number) if self._tracked else "",
+            scene_id=self._scene_id(number) if self._tracked else "",
             model=MODEL,
             max_modes=1,
             merge=False,

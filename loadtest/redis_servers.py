@@ -1,4 +1,4 @@
-"""Real Redis servers on free ports of this machine, and a network between them and us that can fail."""
+"""Redis servers on free local ports, and a proxy that injects network faults."""
 
 import asyncio
 import random
@@ -16,28 +16,27 @@ from pathlib import Path
 from types import TracebackType
 from typing import Literal, Self
 
-import pytest
 import redis
 from redis.backoff import NoBackoff
 from redis.retry import Retry
 
 HOST = "127.0.0.1"
 MASTER_NAME = "tracks"
-"""By which the Sentinels know their master."""
+"""Name of the master in the Sentinels."""
 
 _PORTS = (20000, 22767)
-"""Below those that the system gives out by itself, and so are these + 10000, on which cluster nodes talk."""
+"""Range below the ephemeral ports, also with the 10000 that cluster nodes add for their bus."""
 _BUS = 10000
 _ATTEMPTS = 20
 _START_SECONDS = 20.0
-"""A server is up in milliseconds, unless the machine is very busy."""
+"""Start timeout; a server is up in milliseconds, unless the machine is very busy."""
 _NODE_TIMEOUT = 1000
-"""ms after which a cluster node or a master is taken for dead."""
+"""Milliseconds after which a cluster node or a master counts as failed."""
 
 
 @dataclass
 class Process:
-    """One redis-server."""
+    """A redis-server process."""
 
     port: int
     folder: Path
@@ -46,42 +45,47 @@ class Process:
 
     @property
     def url(self) -> str:
-        """Address of this server."""
+        """URL of this server."""
         return f"redis://{f':{self.password}@' if self.password else ''}{HOST}:{self.port}"
 
     def command(self, *words: str | int) -> object:
-        """What it answers to a command, over a connection of its own.
+        """Run a command over a new connection and return the raw reply.
 
         Raises:
-            redis.RedisError: it does not answer, or with an error.
+            redis.RedisError: the server does not answer, or answers with an error.
         """
         with redis.Redis(
             HOST, self.port, password=self.password, socket_timeout=5, protocol=2, retry=Retry(NoBackoff(), 0)
         ) as client:
-            client.response_callbacks.clear()  # as it came
+            client.response_callbacks.clear()  # raw replies
             return client.execute_command(*words)
 
     def text(self, *words: str | int) -> str:
-        """The same for a command that is answered with a text."""
-        answer = self.command(*words)
-        assert isinstance(answer, bytes)
-        return answer.decode()
+        """Run a command and return its text reply.
+
+        Raises:
+            TypeError: the reply is not a text.
+        """
+        reply = self.command(*words)
+        if not isinstance(reply, bytes):
+            raise TypeError(f"the reply is not a text: {reply!r}")
+        return reply.decode()
 
     def pause(self) -> None:
-        """It hangs: connections are taken by the system, but nothing is answered."""
+        """Make the server hang: the system accepts connections, but nothing is answered."""
         self.process.send_signal(signal.SIGSTOP)
 
     def resume(self) -> None:
-        """It goes on."""
+        """Continue after ``pause``."""
         self.process.send_signal(signal.SIGCONT)
 
     def kill(self) -> None:
-        """It is gone, without a word."""
+        """Kill the server."""
         self.process.kill()
         self.process.wait()
 
     def stop(self) -> None:
-        """It ends."""
+        """Stop the server."""
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGCONT)
             self.process.terminate()
@@ -99,7 +103,7 @@ class Cluster:
 
     @property
     def url(self) -> str:
-        """Address of the cluster, by its first nodes."""
+        """URL of the cluster, with its first nodes."""
         return f"redis+cluster://{','.join(f'{HOST}:{node.port}' for node in self.nodes[:3])}"
 
 
@@ -113,18 +117,21 @@ class Sentinels:
 
     @property
     def url(self) -> str:
-        """Address of the master, by the Sentinels."""
+        """URL of the master, with the Sentinels."""
         hosts = ",".join(f"{HOST}:{sentinel.port}" for sentinel in self.sentinels)
         return f"redis+sentinel://{hosts}/{MASTER_NAME}"
 
 
 @contextmanager
 def single(*options: str, password: str | None = None) -> Iterator[Process]:
-    """One server.
+    """Run one server.
 
     Args:
-        options: more of them, as on its command line: "--maxmemory", "8mb".
-        password: of its default user; None: none is asked for.
+        options: further command line options, such as "--maxmemory", "8mb".
+        password: password of the default user; None: no password.
+
+    Raises:
+        FileNotFoundError: Redis is not installed.
     """
     with ExitStack() as stack:
         yield _start(stack, *options, password=password)
@@ -132,7 +139,7 @@ def single(*options: str, password: str | None = None) -> Iterator[Process]:
 
 @contextmanager
 def cluster() -> Iterator[Cluster]:
-    """Three masters with a replica each."""
+    """Run three masters with a replica each."""
     with ExitStack() as stack:
         options = ["--cluster-enabled", "yes", "--cluster-node-timeout", str(_NODE_TIMEOUT)]
         nodes = [_start(stack, *options, bus=True) for _ in range(6)]
@@ -145,22 +152,22 @@ def cluster() -> Iterator[Cluster]:
 
 @contextmanager
 def sentinels() -> Iterator[Sentinels]:
-    """A master, its replica and three Sentinels that watch them."""
+    """Run a master, its replica and three Sentinels that watch them."""
     with ExitStack() as stack:
         master = _start(stack)
         replica = _start(stack, "--replicaof", f"{HOST} {master.port}")
         until(lambda: "master_link_status:up" in replica.text("INFO"))
         watchers = [_start(stack, sentinel_of=master) for _ in range(3)]
-        # Before they know of each other and of the replica there is no failover.
+        # There is no failover before they know each other and the replica
         until(lambda: all(_knows_all(watcher) for watcher in watchers))
         yield Sentinels(master, replica, watchers)
 
 
 def until(true: Callable[[], bool], seconds: float = 30.0) -> None:
-    """Returns when something has become true; a server that does not answer (yet) counts as not.
+    """Wait until a condition is true; Redis errors count as false.
 
     Raises:
-        TimeoutError: it has not in that time.
+        TimeoutError: the condition is still false after that time.
     """
     give_up = time.monotonic() + seconds
     while time.monotonic() < give_up:
@@ -172,30 +179,29 @@ def until(true: Callable[[], bool], seconds: float = 30.0) -> None:
 
 
 def free_port(bus: bool = False) -> int:
-    """A port that nobody listens on.
+    """Return a free port.
 
     Args:
-        bus: nor on the one that a cluster node there would talk to others on.
+        bus: whether the bus port of a cluster node there must be free too.
     """
     for _ in range(_ATTEMPTS):
-        port = random.randint(*_PORTS)
+        port = random.randint(*_PORTS)  # noqa: S311
         if _is_free(port) and (not bus or _is_free(port + _BUS)):
             return port
     raise RuntimeError("no free port found")
 
 
 Mode = Literal["pass", "slow", "stall", "close"]
-"""What becomes of bytes: they pass, they pass late, they wait for another mode; or connections are closed,
-new ones at once."""
+"""Treatment of the traffic: pass it, delay it, hold it until the mode changes, or close all connections."""
 
 
 class FaultProxy:
-    """A TCP proxy that can be told to fail, in a thread of its own."""
+    """TCP proxy with injected faults, in its own thread."""
 
     def __init__(self, port: int) -> None:
         """
         Args:
-            port: of the server behind it.
+            port: port of the server behind it.
         """
         self._target = port
         self._mode: Mode = "pass"
@@ -206,23 +212,23 @@ class FaultProxy:
         self._connections: set[asyncio.Task[None]] = set()
         self._server: asyncio.Server | None = None
         self.port = 0
-        """Of the proxy."""
+        """Port of the proxy."""
         self.accepted = 0
-        """Connections that were made to it, ever."""
-        self.most = 0
-        """Connections to it at the same time, at most."""
+        """Number of connections accepted so far."""
+        self.max_connections = 0
+        """Highest number of concurrent connections."""
 
     @property
     def url(self) -> str:
-        """Address of the server by way of the proxy."""
+        """URL of the server through the proxy."""
         return f"redis://{HOST}:{self.port}"
 
     def set(self, mode: Mode, delay: float | tuple[float, float] = 0.0) -> None:
-        """From now on this is what happens.
+        """Set the treatment of the traffic.
 
         Args:
-            mode: to the bytes of all connections, in both directions.
-            delay: s that "slow" takes at least in each direction; or two bounds of a random one.
+            mode: treatment of all connections, in both directions.
+            delay: seconds of delay in each direction for "slow", or the two bounds of a random delay.
         """
         bounds = delay if isinstance(delay, tuple) else (delay, delay)
         self._do(self._set(mode, bounds))
@@ -248,8 +254,8 @@ class FaultProxy:
         self.port = self._server.sockets[0].getsockname()[1]
 
     async def _close(self) -> None:
-        assert self._server is not None
-        self._server.close()
+        if self._server is not None:
+            self._server.close()
         await self._drop()
 
     async def _set(self, mode: Mode, delay: tuple[float, float]) -> None:
@@ -268,9 +274,10 @@ class FaultProxy:
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.accepted += 1
         connection = asyncio.current_task()
-        assert connection is not None
+        if connection is None:
+            raise RuntimeError("not in a task")
         self._connections.add(connection)
-        self.most = max(self.most, len(self._connections))
+        self.max_connections = max(self.max_connections, len(self._connections))
         server: asyncio.StreamWriter | None = None
         try:
             if self._mode == "close":
@@ -287,7 +294,7 @@ class FaultProxy:
                     pump.cancel()
                 await asyncio.gather(*pumps, return_exceptions=True)
         except (OSError, asyncio.CancelledError):
-            pass  # as cancelled by us alone, there is nobody to tell
+            pass  # only this class cancels the task
         finally:
             self._connections.discard(connection)
             for end in (writer, server):
@@ -300,7 +307,7 @@ class FaultProxy:
         with suppress(OSError):
             while data := await reader.read(2**16):
                 if self._mode == "slow":
-                    await asyncio.sleep(random.uniform(*self._delay))
+                    await asyncio.sleep(random.uniform(*self._delay))  # noqa: S311
                 while self._mode == "stall":
                     await self._changed.wait()
                 writer.write(data)
@@ -314,9 +321,9 @@ def _start(
     bus: bool = False,
     sentinel_of: Process | None = None,
 ) -> Process:
-    """Starts a server that ends with the stack."""
+    """Start a server that stops with the stack."""
     program = _program("redis-server")
-    for _ in range(_ATTEMPTS):  # as somebody else may take the port first
+    for _ in range(_ATTEMPTS):  # another process may take the port first
         port = free_port(bus)
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="redis-test-")))
         words = ["--port", str(port), "--bind", HOST, "--dir", str(folder), "--loglevel", "warning"]
@@ -342,7 +349,7 @@ def _start(
 
 
 def _is_up(server: Process) -> bool:
-    """Whether it answers; waits until it does or has ended."""
+    """Wait until the server answers or has ended, and return whether it answers."""
     give_up = time.monotonic() + _START_SECONDS
     while time.monotonic() < give_up and server.process.poll() is None:
         with suppress(redis.RedisError):
@@ -364,15 +371,16 @@ def _is_free(port: int) -> bool:
 def _program(name: str) -> str:
     found = shutil.which(name)
     if found is None:
-        pytest.skip(f"{name} is not installed")
+        raise FileNotFoundError(f"{name} is not installed")
     return found
 
 
 def _joined(node: Process) -> bool:
-    """Whether a cluster node knows that all are well."""
+    """Return whether a cluster node sees a healthy cluster."""
     return "cluster_state:ok" in node.text("CLUSTER INFO") and node.text("CLUSTER NODES").count("slave") == 3
 
 
 def _knows_all(watcher: Process) -> bool:
-    """Whether a Sentinel knows of the replica and of both other Sentinels."""
-    return "status=ok" in (told := watcher.text("INFO")) and "slaves=1,sentinels=3" in told
+    """Return whether a Sentinel knows the replica and both other Sentinels."""
+    info = watcher.text("INFO")
+    return "status=ok" in info and "slaves=1,sentinels=3" in info
