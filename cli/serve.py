@@ -79,7 +79,7 @@ def serve(
 
 
 def _serve(settings: "Settings", demo: bool) -> None:
-    from service.server import Server, StartError  # noqa: PLC0415
+    from service.server import ServeError, Server, StartError  # noqa: PLC0415
     from service.telemetry import logs  # noqa: PLC0415
 
     logs.configure(settings.log_level, settings.log_json)
@@ -91,7 +91,7 @@ def _serve(settings: "Settings", demo: bool) -> None:
     try:
         with asyncio.Runner(loop_factory=_loop_factory()) as runner:
             runner.run(main())
-    except StartError as error:
+    except (StartError, ServeError) as error:
         fail(str(error))
 
 

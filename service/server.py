@@ -1,4 +1,4 @@
-"""The server: both transports over one data plane, from start to drain."""
+"""Server: both transports over one data plane, from start to drain."""
 
 import asyncio
 import signal
@@ -10,6 +10,7 @@ import structlog
 
 from model.checkpoint import CheckpointError
 from model.registry import DuplicateModelError, Registry
+from service.errors import Unavailable
 from service.predict.catalog import Models
 from service.predict.dataplane import DataPlane
 from service.settings import Settings, SettingsError, bundled_models
@@ -20,18 +21,26 @@ from service.transports.rest.server import HttpServer, build_app
 _log = structlog.get_logger(__name__)
 
 
+_READINESS_PERIOD = 1.0
+"""Seconds between checks of the readiness that gRPC health reports."""
+
+
 class StartError(Exception):
-    """The server cannot start; the text says why, for an operator."""
+    """Error of a server that cannot start; the text says why, for an operator."""
+
+
+class ServeError(Exception):
+    """Error of a server that ended because it could answer no calls any more."""
 
 
 class Server:
-    """One server. ``start`` it, then ``stop`` it, or ``run`` it until a signal comes."""
+    """One server: ``start`` and ``stop`` it, or ``run`` it until a signal."""
 
     def __init__(self, settings: Settings, load: Callable[[], Models] | None = None) -> None:
         """
         Args:
-            settings: all of them.
-            load: gives the models; default: the baselines and the checkpoints that the settings name.
+            settings: the settings.
+            load: returns the models; default: the baselines and the checkpoints that the settings name.
         """
         self.settings = settings
         self.metrics = Metrics()
@@ -40,6 +49,7 @@ class Server:
         self._grpc = GrpcServer(self.dataplane, self.metrics, settings)
         self._http = HttpServer(build_app(self.dataplane, self.metrics, settings), settings.http)
         self._signalled = asyncio.Event()
+        self._following: asyncio.Task[None] | None = None
 
     @property
     def http_address(self) -> str:
@@ -52,7 +62,7 @@ class Server:
         return self._grpc.address
 
     async def start(self) -> None:
-        """Listens at once, so that probes get an answer; ready when this returns.
+        """Listen, so that probes are answered, then load the models and accept calls.
 
         Raises:
             StartError: an address cannot be listened on, or a model is missing or broken.
@@ -68,6 +78,7 @@ class Server:
             await self.stop(drain=False)
             raise
         self._grpc.set_serving(not self._signalled.is_set())
+        self._following = asyncio.create_task(self._follow_readiness(), name="readiness")
         _log.info(
             "ready",
             http=self.http_address,
@@ -76,15 +87,17 @@ class Server:
         )
 
     async def stop(self, drain: bool = True) -> None:
-        """Refuses new calls, finishes the accepted ones within ``drain_seconds``, and stops.
+        """Refuse new calls, finish the accepted ones within ``drain_seconds``, and stop.
 
-        An answer counts as finished when the client has it: what the calls leave of that time is for those
-        that read slowly.
+        A call is finished when the client has received its response: clients that read slowly get the rest of
+        that time.
 
         Args:
-            drain: False: accepted calls are not waited for.
+            drain: False: do not wait for accepted calls.
         """
         started = time.perf_counter()
+        if self._following is not None:
+            self._following.cancel()
         self.dataplane.refuse()
         self._grpc.set_serving(False)
         grace = 0.0
@@ -97,13 +110,14 @@ class Server:
         _log.info("stopped", seconds=round(time.perf_counter() - started, 3))
 
     async def run(self, when_ready: Callable[["Server"], None] | None = None) -> None:
-        """Serves until SIGTERM or SIGINT, then drains.
+        """Serve until SIGTERM or SIGINT, then drain.
 
         Args:
-            when_ready: called in a thread once the server takes calls.
+            when_ready: called in a thread once the server accepts calls.
 
         Raises:
-            StartError: as ``start``.
+            StartError: see ``start``.
+            ServeError: the server could answer no calls any more.
         """
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
@@ -111,7 +125,7 @@ class Server:
         starting = asyncio.create_task(self.start())
         signalled = asyncio.create_task(self._signalled.wait())
         await asyncio.wait({starting, signalled}, return_when=asyncio.FIRST_COMPLETED)
-        if not starting.done():  # a signal while the models load: nothing was accepted yet
+        if not starting.done():  # a signal while the models load: no call has been accepted yet
             starting.cancel()
             with suppress(asyncio.CancelledError):
                 await starting
@@ -122,13 +136,34 @@ class Server:
             signalled.cancel()
         if when_ready is not None:
             await asyncio.to_thread(when_ready, self)
-        await self._signalled.wait()
+        ends = [asyncio.create_task(event.wait()) for event in (self._signalled, self.dataplane.failed)]
+        await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
+        for end in ends:
+            end.cancel()
+        failed = not self._signalled.is_set()
         await self.stop()
+        if failed:
+            raise ServeError("the server ended after a failure; its log says why")
 
     def _on_signal(self, number: int) -> None:
         _log.info("signal", name=signal.Signals(number).name)
         self.dataplane.refuse()
         self._signalled.set()
+
+    async def _follow_readiness(self) -> None:
+        """Keep gRPC health the same as ``/readyz``, which is evaluated whenever it is called."""
+        serving = True
+        while True:
+            await asyncio.sleep(_READINESS_PERIOD)
+            reason = ""
+            try:
+                self.dataplane.require_ready()
+            except Unavailable as error:
+                reason = error.detail
+            if serving == bool(reason):
+                serving = not serving
+                self._grpc.set_serving(serving)
+                _log.warning("readiness changed", ready=serving, reason=reason)
 
     async def _listen(self) -> None:
         try:
@@ -141,12 +176,12 @@ class Server:
             raise StartError(
                 f"http: cannot listen on {self.settings.http}: {error.strerror or error}"
             ) from error
-        authentication = "bearer tokens" if self.settings.api_tokens else "off: everyone is let in"
+        authentication = "bearer tokens" if self.settings.api_tokens else "off: every caller is accepted"
         _log.info("listening", http=self.http_address, grpc=self.grpc_address, authentication=authentication)
 
 
 def _load_models(settings: Settings) -> Registry:
-    """The baselines and the checkpoints."""
+    """Return the baselines and the checkpoints of the models folder."""
     folder = settings.models or bundled_models()
     if settings.models is not None and not settings.models.is_dir():
         raise SettingsError(f"models: no such folder: {settings.models}")
@@ -155,10 +190,10 @@ def _load_models(settings: Settings) -> Registry:
         "models loaded", folder=str(folder) if folder else None, models=[i.name for i in registry.infos()]
     )
     if registry.passed_over:
-        # Somebody's own folder may be meant to be served whole; the bundled one is not
+        # The user may expect all models of an own folder to be served; not so of the bundled one
         log = _log.info if settings.models is None else _log.warning
         log(
-            "models passed over: they are of the paper protocol",
+            "models skipped: trained by the paper protocol",
             folder=str(folder),
             models=[info.full_name for info in registry.passed_over],
             load_with="--allow-paper-protocol or FORECAST_ALLOW_PAPER_PROTOCOL=true",

@@ -4,10 +4,12 @@ import asyncio
 import shutil
 import signal
 import socket
+import threading
 import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager, suppress
 from pathlib import Path
+from unittest.mock import Mock
 
 import grpc
 import httpx
@@ -20,7 +22,8 @@ from cab_forecast import AsyncClient, Client
 from model.checkpoint import save_checkpoint
 from model.forecaster import Protocol
 from model.registry import Registry
-from service.server import Server, StartError
+from service.lifecycle import Phase
+from service.server import ServeError, Server, StartError
 from service.settings import Settings
 from tests.model.checkpoints import info, network, tensors
 from tests.service.fakes import FakeForecaster, registry
@@ -97,6 +100,52 @@ async def test_stop_answers_what_was_accepted() -> None:
         await stopping
         for response in await asyncio.gather(*calls):
             assert len(response.forecasts) == 1
+
+
+async def health(server: Server) -> int:
+    async with grpc.aio.insecure_channel(server.grpc_address) as channel:
+        asked = health_pb2.HealthCheckRequest()
+        return int((await health_pb2_grpc.HealthStub(channel).Check(asked)).status)
+
+
+async def test_a_forward_that_hangs_makes_the_server_not_ready(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.server._READINESS_PERIOD", 0.02)
+    fake = FakeForecaster()
+    async with running(fake, max_timeout=0.3) as server, httpx.AsyncClient() as client:
+        ready = f"http://{server.http_address}/readyz"
+        assert (await client.get(ready)).status_code == 200
+        fake.free.clear()
+        with pytest.raises(CallError) as caught:
+            await call_grpc(server, make_request(1))
+        assert caught.value.code == "DEADLINE_EXCEEDED"
+        async with asyncio.timeout(10):
+            while (refused := await client.get(ready)).status_code == 200:  # noqa: ASYNC110
+                await asyncio.sleep(0.02)
+            assert refused.status_code == 503
+            assert "has not returned for" in refused.json()["detail"]
+            while await health(server) != health_pb2.HealthCheckResponse.NOT_SERVING:  # noqa: ASYNC110
+                await asyncio.sleep(0.02)
+            fake.free.set()
+            while (await client.get(ready)).status_code != 200:  # noqa: ASYNC110
+                await asyncio.sleep(0.02)
+            while await health(server) != health_pb2.HealthCheckResponse.SERVING:  # noqa: ASYNC110
+                await asyncio.sleep(0.02)
+
+
+async def test_a_crash_of_the_batcher_ends_the_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = FakeForecaster()
+    server = Server(settings(default_model="fake"), load=lambda: registry(fake))
+    ready = threading.Event()
+    serving = asyncio.create_task(server.run(lambda _: ready.set()))
+    assert await asyncio.to_thread(ready.wait, 30)
+    monkeypatch.setattr(server.dataplane._batcher, "_deliver", Mock(side_effect=RuntimeError("a bug")))
+    with pytest.raises(CallError) as caught:
+        await call_grpc(server, make_request(1))
+    assert caught.value.code == "INTERNAL"
+    assert server.dataplane.phase is Phase.FAILED
+    async with asyncio.timeout(20):
+        with pytest.raises(ServeError):
+            await serving
 
 
 _PACE = 0.008
@@ -261,7 +310,9 @@ async def test_stop_waits_for_no_health_watch() -> None:
         assert caught.value.code() is grpc.StatusCode.UNAVAILABLE
 
 
-@pytest.mark.parametrize(("tokens", "told"), [((), "off: everyone is let in"), (("t",), "bearer tokens")])
+@pytest.mark.parametrize(
+    ("tokens", "told"), [((), "off: every caller is accepted"), (("t",), "bearer tokens")]
+)
 async def test_the_log_says_who_is_let_in(tokens: tuple[str, ...], told: str) -> None:
     with capture_logs() as logs:
         async with running(FakeForecaster(), api_tokens=tokens):
@@ -325,7 +376,7 @@ async def test_the_bundled_cab_is_the_default(tmp_path: Path, monkeypatch: pytes
     with capture_logs() as logs:
         await server.start()
     try:
-        (told,) = (entry for entry in logs if "passed over" in entry["event"])
+        (told,) = (entry for entry in logs if "skipped" in entry["event"])
         assert (told["log_level"], told["models"]) == ("info", ["cab@1.0.0+paper"])
         assert "--allow-paper-protocol" in told["load_with"]
         answer = await call_grpc(server, make_request(1))
@@ -366,7 +417,7 @@ async def test_a_folder_of_ones_own_warns_and_one_of_the_paper_protocol_alone_is
     as_bundled(tmp_path)
     with capture_logs() as logs:
         assert Server(settings(models=tmp_path))._load().get("cab").info.version == "1.0.0"
-    assert [entry["log_level"] for entry in logs if "passed over" in entry["event"]] == ["warning"]
+    assert [entry["log_level"] for entry in logs if "skipped" in entry["event"]] == ["warning"]
     shutil.rmtree(tmp_path / "1.0.0")
     with pytest.raises(StartError, match=r"paper protocol, and there is no other .*--allow-paper-protocol"):
         await Server(settings(models=tmp_path)).start()

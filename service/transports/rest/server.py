@@ -15,7 +15,6 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 
 from service.errors import BadField, MethodNotAllowed, NotFound, ServiceError, Unavailable
-from service.lifecycle import Phase
 from service.predict.dataplane import DataPlane
 from service.settings import Settings, split_address
 from service.telemetry.metrics import Metrics
@@ -57,9 +56,11 @@ def build_app(dataplane: DataPlane, metrics: Metrics, settings: Settings) -> Fas
         return PlainTextResponse("alive\n")
 
     async def readyz(_: Request) -> Response:
-        if dataplane.phase is Phase.READY:
-            return PlainTextResponse("ready\n")
-        return problem_response(Unavailable(f"the server is {dataplane.phase.value}"))
+        try:
+            dataplane.require_ready()
+        except Unavailable as error:
+            return problem_response(error)
+        return PlainTextResponse("ready\n")
 
     async def show_metrics(_: Request) -> Response:
         return Response(metrics.render(), media_type=prometheus_client.CONTENT_TYPE_LATEST)

@@ -1,12 +1,16 @@
 """The queue: who rides with whom, who is refused, and who leaves it."""
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
+from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 import torch
+from structlog.testing import capture_logs
 
 from model.forecaster import Context, Features
+from model.mixture import TrajectoryMixture
 from model.scenes.scene import AgentType
 from service.errors import DeadlineExceeded, Internal, Overloaded, Unavailable
 from service.predict.batcher import Batcher, Call, Job, Outcome
@@ -243,6 +247,85 @@ async def test_a_forward_of_the_wrong_size_is_a_failure(
     monkeypatch.setattr(fake, "forecast", lambda *arguments: made(*arguments)[:1])
     with pytest.raises(Internal):
         await submit(batcher, job(fake, 2))
+
+
+def wrong_modes(mixture: TrajectoryMixture) -> TrajectoryMixture:
+    return TrajectoryMixture(
+        mixture.log_weights[:, :2], mixture.means[:, :2], mixture.covariances[:, :2], mixture.origin
+    )
+
+
+def wrong_steps(mixture: TrajectoryMixture) -> TrajectoryMixture:
+    return TrajectoryMixture(
+        mixture.log_weights, mixture.means[:, :, :3], mixture.covariances[:, :, :3], mixture.origin
+    )
+
+
+def wrong_weights(mixture: TrajectoryMixture) -> TrajectoryMixture:
+    return replace(mixture, log_weights=mixture.log_weights[:, :2])
+
+
+def wrong_origins(mixture: TrajectoryMixture) -> TrajectoryMixture:
+    return replace(mixture, origin=mixture.origin[:1])
+
+
+@pytest.mark.parametrize("change", [wrong_modes, wrong_steps, wrong_weights, wrong_origins])
+async def test_a_forward_of_other_modes_or_steps_is_a_failure(
+    batcher: Batcher,
+    fake: FakeForecaster,
+    monkeypatch: pytest.MonkeyPatch,
+    change: Callable[[TrajectoryMixture], TrajectoryMixture],
+) -> None:
+    fake.free.set()
+    made = fake.forecast
+    monkeypatch.setattr(fake, "forecast", lambda *arguments: change(made(*arguments)))
+    with capture_logs() as logs, pytest.raises(Internal):
+        await submit(batcher, job(fake, 2))
+    [error] = [entry for entry in logs if entry["event"] == "forward failed"]
+    assert error["model"] == "fake"
+    monkeypatch.undo()
+    assert await submit(batcher, job(fake, 2))
+
+
+async def test_a_crash_of_the_worker_fails_every_call(
+    fake: FakeForecaster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    crashed = asyncio.Event()
+    batcher = Batcher(8, 20, Metrics())
+    batcher.start(crashed.set)
+    running = await hold(batcher, fake)
+    queued = submit(batcher, job(fake, 1, kind=PEDESTRIAN))
+    await settle()
+    monkeypatch.setattr(batcher, "_deliver", Mock(side_effect=RuntimeError("a bug")))
+    fake.free.set()
+    async with asyncio.timeout(10):
+        await crashed.wait()
+        for call in (running, queued, submit(batcher, job(fake, 1))):
+            with pytest.raises(Internal):
+                await call
+    assert (batcher.waiting, batcher.forward_seconds) == (0, 0.0)
+    await batcher.stop()
+
+
+async def test_a_stop_is_no_crash(fake: FakeForecaster) -> None:
+    crashed = asyncio.Event()
+    batcher = Batcher(8, 20, Metrics())
+    batcher.start(crashed.set)
+    await settle()
+    await batcher.stop()
+    await settle()
+    assert not crashed.is_set()
+
+
+async def test_the_age_of_a_forward_is_known(batcher: Batcher, fake: FakeForecaster) -> None:
+    assert batcher.forward_seconds == 0
+    first = await hold(batcher, fake)
+    await asyncio.sleep(0.05)
+    assert batcher.forward_seconds >= 0.05
+    fake.free.set()
+    await first
+    await settle()
+    assert batcher.forward_seconds == 0
 
 
 async def test_stop_fails_what_waits_and_finishes_what_runs(fake: FakeForecaster) -> None:
