@@ -1,10 +1,13 @@
-"""Observations at any rate, brought onto the 0.5 s grid that forecasters work on.
+"""Resampling of observations at any rate onto the 0.5 s grid of the forecasters.
 
-Causal: a grid state depends on what was observed up to the present, never on the future (REFERENCE:
-the papers' released preprocessing differentiates centrally over whole tracks; a live service cannot).
-At 2 Hz what an observation gives is used as it is, and what it does not give is derived by backward
-differences. Denser observations are evidence, to which the states are fitted (``model.scenes.state_fit``); in
-between, from 2.5 to some 4.5 Hz, the one passes over into the other.
+Resampling is causal: a grid state depends on observations up to the present, never on the future (REFERENCE:
+the papers' released preprocessing differentiates centrally over whole tracks, which a live service cannot
+do). At 2 Hz, given values are used as they are, and missing ones are derived by backward differences. Denser
+observations are evidence, to which states are fitted (``model.scenes.state_fit``). From 2.5 to about 4.5 Hz,
+the first method passes over into the second.
+
+The steps, in the order of this file: drop later observations, correct flipped headings, interpolate onto the
+grid, derive missing values, extrapolate agents last seen a moment ago, and blend with the fitted states.
 """
 
 from collections.abc import Callable
@@ -19,71 +22,71 @@ from model.scenes.scene import STEP_SECONDS, AgentStates
 from model.scenes.state_fit import MIN_HEADING_SPEED, FittedStates, fit_states
 
 TIME_TOLERANCE = 1e-4
-"""s; an observation this near to a grid time stands for it (3 mm at 30 m/s)."""
+"""s; an observation this near to a grid time counts as at that time (3 mm at 30 m/s)."""
 MAX_AGE = 0.5
-"""s; an agent whose newest observation is older is not observed now."""
+"""s, maximum age of the newest observation of an agent that is observed now."""
 MAX_GAP = 1.05
-"""s; positions are interpolated between observations no further apart: one lost frame at 2 Hz."""
+"""s, maximum gap to interpolate over: one lost frame at 2 Hz."""
 MIN_DIFFERENCE_SPAN = 0.05
-"""s; a shorter span makes a difference quotient of noise."""
+"""s, minimum span of a difference quotient; over a shorter one it would be noise."""
 FLIP_SPEED = 2.0
-"""m/s; from this speed on, motion shows that a single heading is the wrong way round."""
+"""m/s; from this speed on, motion shows that a single heading is flipped by half a turn."""
 
-# Two frames older than those returned: the oldest velocity and acceleration are then differences, too,
-# wherever the agent has been seen that long.
+# Two frames older than the returned ones, so that the oldest velocity and acceleration are differences, too,
+# if the agent has been observed that long.
 _EXTRA_FRAMES = 2
-_MIN_FLIP_SPAN = 0.15  # s; observations nearer to each other are fitted, and their differences are noise
-_ROUNDING = 1e-6  # s; of differences of times since the epoch (a quarter of it at float64), with room
+_MIN_FLIP_SPAN = 0.15  # s; observations nearer to each other are fitted; their differences are noise
+_ROUNDING = 1e-6  # s; exceeds the rounding of float64 differences of times since the epoch four times
 
 
 def resample(observations: Observations, time: float, frames: int) -> AgentStates:
-    """States on the grid ``time − k · 0.5 s``.
+    """Resample observations onto the grid ``time − k · 0.5 s``.
 
-    At 2 Hz positions, and given headings, velocities and so on, are those of the observations at the grid
-    times; between observations at most ``MAX_GAP`` apart they are interpolated linearly; history before a
+    At 2 Hz, positions and given headings, velocities and so on are those of the observations at the grid
+    times. Between observations at most ``MAX_GAP`` apart they are interpolated linearly; history before a
     wider gap is dropped. Derivatives that are not given are backward differences on the grid, of values that
-    are both given or both derived; where the oldest frame has no predecessor, its velocity and heading rate
-    are those of the next frame and its acceleration is zero. A single given heading that points backwards
-    (more than 90° off the motion, at ``FLIP_SPEED`` or more, and off the headings before and after it) is
-    replaced by the direction of motion.
+    are both given or both derived. The oldest frame has no predecessor: its velocity and heading rate are
+    those of the next frame, and its acceleration is zero. A single given heading that points backwards (more
+    than 90° off the motion, at ``FLIP_SPEED`` or more, and off the headings before and after it) is replaced
+    by the direction of motion.
 
     Where observations are denser, position, velocity, acceleration, heading and heading rate are those of a
-    fit to the observations within ``model.scenes.state_fit.WINDOW`` before the grid time and,
-    up to the present, after it. Given derivatives are measurements like others. So is the course
-    over ground, for the heading of what moves; an agent that reverses keeps its headings.
+    fit to the observations within ``model.scenes.state_fit.WINDOW`` before the grid time and, up to the
+    present, after it. Given derivatives are measurements for this fit. The course over ground is one of the
+    heading, if the agent moves; an agent that reverses keeps its headings.
 
-    A heading that is not given is the direction of motion from ``MIN_HEADING_SPEED`` on (the opposite one
-    for an agent whose given headings show that it reverses), else the last known one.
+    A heading that is not given is the direction of motion from ``MIN_HEADING_SPEED`` on (the opposite
+    direction if given headings show that the agent reverses), else the last known heading.
 
-    An agent last seen up to ``MAX_AGE`` ago is carried to the present at its velocity then; velocity,
-    acceleration, heading and heading rate are those of when it was last seen.
+    An agent last seen up to ``MAX_AGE`` ago is extrapolated to the present at its last velocity; velocity,
+    acceleration, heading and heading rate stay those of its last observation.
 
     Args:
-        observations: N agents; those later than ``time`` (+ tolerance) are not looked at.
+        observations: N agents; observations later than ``time`` (+ tolerance) are ignored.
         time: the present, s.
-        frames: F, how many frames to return at most.
+        frames: F, maximum number of frames to return.
 
     Returns:
         [N, F, …]; ``first`` is F for an agent that is not observed now.
     """
     count = frames + _EXTRA_FRAMES
-    seen = _upright(_until(observations, time))
+    seen = _correct_flipped_headings(_without_future(observations, time))
     newest = _newest_time(seen)
     age = time - newest
-    carried = (age > TIME_TOLERANCE) & (age <= MAX_AGE + TIME_TOLERANCE)
-    states = _as_observed(seen, time, count, carried).last_frames(frames)
+    extrapolated = (age > TIME_TOLERANCE) & (age <= MAX_AGE + TIME_TOLERANCE)
+    states = _observed_states(seen, time, count, extrapolated).last_frames(frames)
     times = _grid(np.full(len(newest), time), states.frames)
-    times[carried, -1] = newest[carried]
-    return _fitted(states, fit_states(seen, times), np.where(carried, age, 0.0))
+    times[extrapolated, -1] = newest[extrapolated]
+    return _blend(states, fit_states(seen, times), np.where(extrapolated, age, 0.0))
 
 
 def history_seconds(frames: int) -> float:
-    """How far before the present ``resample`` looks for so many frames, s."""
+    """Return the age, s, up to which ``resample`` uses observations for that many frames."""
     return (frames + _EXTRA_FRAMES - 1) * STEP_SECONDS + MAX_AGE + MAX_GAP
 
 
-def _until(obs: Observations, time: float) -> Observations:
-    """The observations up to a time (+ tolerance); the others become padding, but for an only one."""
+def _without_future(obs: Observations, time: float) -> Observations:
+    """Turn observations after a time (+ tolerance) into padding, except the first one of an agent."""
     later = np.isfinite(obs.time) & (obs.time > time + TIME_TOLERANCE)
     later[:, 0] = False
     if not later.any():
@@ -91,9 +94,11 @@ def _until(obs: Observations, time: float) -> Observations:
     return replace(obs, count=obs.count - later.sum(axis=1), time=np.where(later, np.inf, obs.time))
 
 
-def _upright(obs: Observations) -> Observations:
-    """Turns single headings about that motion and the headings beside them contradict, where observations
-    are too far apart to be fitted."""
+def _correct_flipped_headings(obs: Observations) -> Observations:
+    """Replace single headings that contradict both the motion and the headings before and after them.
+
+    Only where observations are too far apart to be fitted; the fit deals with outliers by itself.
+    """
     with np.errstate(invalid="ignore"):  # the padding's differences
         span = np.diff(obs.time, axis=1)
     connected = (span >= _MIN_FLIP_SPAN) & (span <= MAX_GAP + _ROUNDING)
@@ -103,7 +108,9 @@ def _upright(obs: Observations) -> Observations:
     moved = np.diff(obs.position, axis=1) / np.where(connected, span, np.inf)[..., None]
     fast = np.hypot(moved[..., 0], moved[..., 1]) >= FLIP_SPEED
     direction = np.where(fast, np.arctan2(moved[..., 1], moved[..., 0]), np.nan)
-    direction = np.concatenate([direction[:, :1], direction], axis=1)  # the first one's is that to the next
+    direction = np.concatenate(
+        [direction[:, :1], direction], axis=1
+    )  # the first observation has the direction to the next
     apart = np.where(connected, np.abs(wrap_angle(after - before)), np.nan)
     none = np.full_like(apart[:, :1], np.nan)
     beside = np.stack([np.concatenate([none, apart], axis=1), np.concatenate([apart, none], axis=1)])
@@ -112,73 +119,37 @@ def _upright(obs: Observations) -> Observations:
     return replace(obs, heading=np.where(flipped, direction, obs.heading)) if flipped.any() else obs
 
 
-def _as_observed(obs: Observations, time: float, count: int, carried: Bools) -> AgentStates:
-    """States as the observations nearest to the grid times have them.
+def _observed_states(obs: Observations, time: float, count: int, extrapolated: Bools) -> AgentStates:
+    """Return grid states by interpolation and backward differences, without a fit.
 
     Args:
-        obs: N agents.
+        obs: observations of N agents.
         time: the present, s.
         count: E, frames.
-        carried: [N], which agents were last seen a while ago.
+        extrapolated: [N], agents whose newest observation is older than the present.
     """
     newest = _newest_time(obs)
-    sampled = _sample(obs, _grid(np.full(len(newest), time), count))
-    if carried.any():
-        # How it moved when last seen: the same derivation, on a grid that ends there
-        last = _derive(_sample(obs, _grid(newest, count)))
-        ahead = last.velocity[carried, -1] * (time - newest[carried])[:, None]
-        sampled.position[carried, -1] = last.position[carried, -1] + ahead
+    sampled = _interpolate(obs, _grid(np.full(len(newest), time), count))
+    if extrapolated.any():
+        # Its motion when last seen: the same derivation, on a grid that ends there
+        last = _derive(_interpolate(obs, _grid(newest, count)))
+        ahead = last.velocity[extrapolated, -1] * (time - newest[extrapolated])[:, None]
+        sampled.position[extrapolated, -1] = last.position[extrapolated, -1] + ahead
     states = _derive(sampled)
-    if carried.any():
+    if extrapolated.any():
         for name in ("velocity", "acceleration", "heading", "heading_rate"):
-            getattr(states, name)[carried, -1] = getattr(last, name)[carried, -1]
+            getattr(states, name)[extrapolated, -1] = getattr(last, name)[extrapolated, -1]
     return replace(states, velocity_known=_last_velocity_known(obs) & (states.first < count))
 
 
-def _fitted(states: AgentStates, fitted: FittedStates, ahead: Floats) -> AgentStates:
-    """Goes from states as observed to fitted ones as far as the fit's share says; without it, not a bit.
-
-    Args:
-        states: [N, E].
-        fitted: [N, E].
-        ahead: [N], s that the last frame's is to be carried on.
-    """
-    share = np.where(states.observed, fitted.share, 0.0)
-    some = share > 0
-    if not some.any():
-        return states
-
-    def mix(observed: Floats, other: Floats) -> Floats:
-        part, mask = (a.reshape(a.shape + (1,) * (observed.ndim - 2)) for a in (share, some))
-        return np.where(mask, observed + part * (other - observed), observed)
-
-    position = fitted.position.copy()
-    position[:, -1] += fitted.velocity[:, -1] * ahead[:, None]
-    # The last known heading is carried from fit to fit; where no fit knows one, it is the observed states'
-    course = _reversed_where_given_so(fitted.course, fitted.heading)
-    heading = np.where(np.isfinite(fitted.heading), fitted.heading, course)
-    heading = _carry(np.where(some, heading, np.nan), states.observed)
-    heading = np.where(np.isfinite(heading), heading, states.heading)
-    unknown = ~np.isfinite(states.heading)
-    turned = wrap_angle(states.heading + share * wrap_angle(heading - states.heading))
-    return replace(
-        states,
-        position=mix(states.position, position),
-        velocity=mix(states.velocity, fitted.velocity),
-        acceleration=mix(states.acceleration, fitted.acceleration),
-        heading=np.where(some, np.where(unknown, heading, turned), states.heading),
-        heading_rate=mix(states.heading_rate, fitted.heading_rate),
-    )
-
-
 def _grid(ends: Floats, frames: int) -> Floats:
-    """Each agent's grid times [N, frames], which end at ``ends`` [N]."""
+    """Return each agent's grid times [N, frames], which end at ``ends`` [N]."""
     return ends[:, None] - STEP_SECONDS * np.arange(frames - 1, -1, -1, dtype=np.float64)
 
 
 @dataclass(frozen=True)
-class _Sampled:
-    """Grid states as observed: NaN where nothing was given. E frames."""
+class _GridSamples:
+    """Observations at E grid times; NaN where nothing was given."""
 
     position: Floats  # [N, E, 2]
     velocity: Floats  # [N, E, 2]
@@ -186,14 +157,17 @@ class _Sampled:
     heading: Floats  # [N, E]
     heading_rate: Floats  # [N, E]
     first: Ints  # [N]
-    first_velocity: Floats  # [N, 2], from observations between the grid times at the start, or NaN
+    first_velocity: Floats  # [N, 2], from the observations just before the first grid frame, or NaN
 
 
-def _sample(obs: Observations, grid: Floats) -> _Sampled:
-    """Interpolates onto grids [N, E]. A last frame after the newest observation is there, without values
-    but for a position that stands in until the agent is carried there."""
+def _interpolate(obs: Observations, grid: Floats) -> _GridSamples:
+    """Interpolate observations onto grids [N, E].
+
+    A last frame after the newest observation has no values, except for a position that is a placeholder until
+    the agent is extrapolated.
+    """
     rows = np.arange(len(obs.count))[:, None]
-    # How many observations lie at or before each grid time: [N, E]
+    # Index of the last observation at or before each grid time: [N, E]
     left = (obs.time[:, :, None] <= grid[:, None, :] + TIME_TOLERANCE).sum(axis=1) - 1
     before = left >= 0
     left = np.maximum(left, 0)
@@ -203,11 +177,13 @@ def _sample(obs: Observations, grid: Floats) -> _Sampled:
 
     exact = before & (np.abs(t_left - grid) <= TIME_TOLERANCE)
     between = before & ~exact & (right > left) & (t_right - t_left <= MAX_GAP + _ROUNDING)
-    carried = before & ~exact & (left == last) & (grid - t_left <= MAX_AGE + TIME_TOLERANCE)
-    carried[:, :-1] = False  # only the present lies after the newest observation of an agent seen now
-    there = exact | between | carried
+    extrapolated = before & ~exact & (left == last) & (grid - t_left <= MAX_AGE + TIME_TOLERANCE)
+    extrapolated[:, :-1] = (
+        False  # of an agent observed now, only the present frame lies after the newest observation
+    )
+    there = exact | between | extrapolated
 
-    # The unbroken run that ends now; a gap too wide to interpolate over has a grid time within it.
+    # The unbroken run that ends now; any gap too wide to interpolate over contains a grid time
     run = np.flip(np.logical_and.accumulate(np.flip(there, axis=1), axis=1), axis=1)
     first = grid.shape[1] - run.sum(axis=1)
 
@@ -225,7 +201,7 @@ def _sample(obs: Observations, grid: Floats) -> _Sampled:
     heading = wrap_angle(a + weight * wrap_angle(b - a))  # along the shorter arc
     heading[~run] = np.nan
     first_time = np.take_along_axis(grid, np.minimum(first, grid.shape[1] - 1)[:, None], axis=1)[:, 0]
-    return _Sampled(
+    return _GridSamples(
         position=interpolate(obs.position),
         velocity=interpolate(obs.velocity),
         acceleration=interpolate(obs.acceleration),
@@ -236,33 +212,18 @@ def _sample(obs: Observations, grid: Floats) -> _Sampled:
     )
 
 
-def _newest_time(obs: Observations) -> Floats:
-    newest: Floats = obs.time[np.arange(len(obs.count)), obs.count - 1]
-    return newest
-
-
-def _last_velocity_known(obs: Observations) -> Bools:
-    """[N], whether the newest observation gives its velocity, or an earlier one that is connected to it
-    (no gap wider than ``MAX_GAP``) is long enough ago for a difference."""
-    rows, last = np.arange(len(obs.count)), obs.count - 1
-    given = np.isfinite(obs.velocity[rows, last, 0])  # both components, or neither
-    with np.errstate(invalid="ignore"):  # the padding's differences
-        gap_after = np.diff(obs.time, axis=1, append=np.inf)
-    index = np.arange(obs.time.shape[1])[None, :]
-    fits = (gap_after <= MAX_GAP + _ROUNDING) | (index >= last[:, None])
-    connected = np.flip(np.logical_and.accumulate(np.flip(fits, axis=1), axis=1), axis=1)
-    early = obs.time <= _newest_time(obs)[:, None] - MIN_DIFFERENCE_SPAN + _ROUNDING
-    known: Bools = given | (connected & early & (index < last[:, None])).any(axis=1)
-    return known
-
-
 def _first_velocity(obs: Observations, first_time: Floats) -> Floats:
-    """[N, 2], m/s over the observations in the half second up to the first grid frame; NaN where none.
+    """Return the velocity over the observations in the half second before the first grid frame.
 
-    There is no grid frame before it, so nothing older is connected to it, unless it is the only one.
+    Older observations do not count: with no grid frame before the first one, they are not connected to it
+    (unless it is the only one).
 
     Args:
-        first_time: [N], s, when the first grid frame is.
+        obs: observations of N agents.
+        first_time: [N], s, time of the first grid frame.
+
+    Returns:
+        [N, 2], m/s; NaN where there are too few observations.
     """
     rows = np.arange(len(obs.count))
     age = first_time[:, None] - obs.time
@@ -276,8 +237,8 @@ def _first_velocity(obs: Observations, first_time: Floats) -> Floats:
     return np.where(usable[:, None], moved / np.where(usable, span, 1.0)[:, None], np.nan)
 
 
-def _derive(s: _Sampled) -> AgentStates:
-    """Fills in what was not given."""
+def _derive(s: _GridSamples) -> AgentStates:
+    """Derive missing values, and return complete states."""
     frames = s.position.shape[1]
     index = np.arange(frames)[None, :]
     observed = index >= s.first[:, None]
@@ -293,15 +254,15 @@ def _derive(s: _Sampled) -> AgentStates:
         (is_first & ~velocity_given)[..., None] & np.isfinite(first_given), first_given, velocity
     )
 
-    change = _like_with_like(s.velocity, moved, velocity_given)
+    change = _consistent_difference(s.velocity, moved, velocity_given)
     change[is_first] = 0.0
     acceleration = np.where(np.isfinite(s.acceleration), s.acceleration, np.nan_to_num(change))
 
     heading_given = np.isfinite(s.heading)
-    direction = _carry(_direction(moved), observed)
-    direction = _reversed_where_given_so(direction, s.heading)
-    heading = _carry(np.where(heading_given, s.heading, direction), observed)
-    turned = _like_with_like(s.heading, direction, heading_given, wrap_angle)
+    direction = _fill_unknown(_direction(moved), observed)
+    direction = _reverse_if_backing(direction, s.heading)
+    heading = _fill_unknown(np.where(heading_given, s.heading, direction), observed)
+    turned = _consistent_difference(s.heading, direction, heading_given, wrap_angle)
     turned[is_first] = np.nan
     heading_rate = np.where(np.isfinite(s.heading_rate), s.heading_rate, turned)
     heading_rate = np.nan_to_num(_fill_first_from_next(heading_rate, is_first))
@@ -313,23 +274,25 @@ def _derive(s: _Sampled) -> AgentStates:
 
 
 def _backward_difference(values: Floats) -> Floats:
-    """(values_t − values_{t−1}) / dt along axis 1; NaN at the first."""
+    """Return (values_t − values_{t−1}) / dt along axis 1; NaN in the first frame."""
     result = np.full_like(values, np.nan)
     result[:, 1:] = (values[:, 1:] - values[:, :-1]) / STEP_SECONDS
     return result
 
 
-def _like_with_like(
+def _consistent_difference(
     given: Floats, derived: Floats, is_given: Bools, difference: Callable[[Floats], Floats] = lambda x: x
 ) -> Floats:
-    """Backward difference quotients of given values, or else of derived ones, never across: a velocity
-    given for an instant and one derived over half a second differ even in steady braking.
+    """Return backward difference quotients of two given values, or else of two derived ones.
+
+    They are never of a given and a derived value: a velocity given for an instant and one derived over half a
+    second differ even in steady braking.
 
     Args:
         given: [N, E, …], NaN where not given.
-        derived: likewise, everywhere.
-        is_given: [N, E].
-        difference: brings plain differences into range.
+        derived: [N, E, …], known in all frames.
+        is_given: [N, E], whether values are given.
+        difference: function that wraps plain differences into range.
     """
     both = np.zeros_like(is_given)
     both[:, 1:] = is_given[:, 1:] & is_given[:, :-1]
@@ -341,7 +304,7 @@ def _like_with_like(
 
 
 def _fill_first_from_next(values: Floats, is_first: Bools) -> Floats:
-    """Takes the next frame's value where the first observed frame has none."""
+    """Fill a missing value of the first observed frame with that of the next frame."""
     following = np.full_like(values, np.nan)
     following[:, :-1] = values[:, 1:]
     mask = is_first.reshape(is_first.shape + (1,) * (values.ndim - 2))
@@ -349,14 +312,76 @@ def _fill_first_from_next(values: Floats, is_first: Bools) -> Floats:
 
 
 def _direction(velocity: Floats) -> Floats:
-    """Heading of motion [N, E], NaN below the speed that tells it."""
+    """Return the direction of motion: [N, E]; NaN below ``MIN_HEADING_SPEED``."""
     moving = np.hypot(velocity[..., 0], velocity[..., 1]) >= MIN_HEADING_SPEED
     return np.where(moving, np.arctan2(velocity[..., 1], velocity[..., 0]), np.nan)
 
 
-def _reversed_where_given_so(direction: Floats, given: Floats) -> Floats:
-    """Directions of motion as headings [N, E]: turned about for agents that go backwards, as their newest
-    given heading shows."""
+def _last_velocity_known(obs: Observations) -> Bools:
+    """Return whether the velocity of the newest observation is known: [N].
+
+    It is if it was given, or if an earlier observation is old enough for a difference quotient and connected
+    to the newest one (without a gap wider than ``MAX_GAP``).
+    """
+    rows, last = np.arange(len(obs.count)), obs.count - 1
+    given = np.isfinite(obs.velocity[rows, last, 0])  # both components, or neither
+    with np.errstate(invalid="ignore"):  # the padding's differences
+        gap_after = np.diff(obs.time, axis=1, append=np.inf)
+    index = np.arange(obs.time.shape[1])[None, :]
+    fits = (gap_after <= MAX_GAP + _ROUNDING) | (index >= last[:, None])
+    connected = np.flip(np.logical_and.accumulate(np.flip(fits, axis=1), axis=1), axis=1)
+    early = obs.time <= _newest_time(obs)[:, None] - MIN_DIFFERENCE_SPAN + _ROUNDING
+    known: Bools = given | (connected & early & (index < last[:, None])).any(axis=1)
+    return known
+
+
+def _newest_time(obs: Observations) -> Floats:
+    """Return the time of each agent's newest observation: [N], s."""
+    newest: Floats = obs.time[np.arange(len(obs.count)), obs.count - 1]
+    return newest
+
+
+def _blend(states: AgentStates, fitted: FittedStates, ahead: Floats) -> AgentStates:
+    """Blend observed with fitted states, by the share of the fit; states of share 0 stay bit-equal.
+
+    Args:
+        states: [N, E], observed states.
+        fitted: [N, E], fitted states.
+        ahead: [N], s, by which the last fitted frame is extrapolated.
+    """
+    share = np.where(states.observed, fitted.share, 0.0)
+    some = share > 0
+    if not some.any():
+        return states
+
+    def mix(observed: Floats, other: Floats) -> Floats:
+        part, mask = (a.reshape(a.shape + (1,) * (observed.ndim - 2)) for a in (share, some))
+        return np.where(mask, observed + part * (other - observed), observed)
+
+    position = fitted.position.copy()
+    position[:, -1] += fitted.velocity[:, -1] * ahead[:, None]
+    # An unknown heading is the last one of a fit; if no fit has one, the observed states' heading
+    course = _reverse_if_backing(fitted.course, fitted.heading)
+    heading = np.where(np.isfinite(fitted.heading), fitted.heading, course)
+    heading = _fill_unknown(np.where(some, heading, np.nan), states.observed)
+    heading = np.where(np.isfinite(heading), heading, states.heading)
+    unknown = ~np.isfinite(states.heading)
+    turned = wrap_angle(states.heading + share * wrap_angle(heading - states.heading))
+    return replace(
+        states,
+        position=mix(states.position, position),
+        velocity=mix(states.velocity, fitted.velocity),
+        acceleration=mix(states.acceleration, fitted.acceleration),
+        heading=np.where(some, np.where(unknown, heading, turned), states.heading),
+        heading_rate=mix(states.heading_rate, fitted.heading_rate),
+    )
+
+
+def _reverse_if_backing(direction: Floats, given: Floats) -> Floats:
+    """Return headings from directions of motion: [N, E].
+
+    They are the opposite of the direction if the agent reverses, as its newest given heading shows.
+    """
     apart = np.abs(wrap_angle(given - direction))
     known = np.isfinite(apart)
     newest = apart.shape[1] - 1 - np.flip(known, axis=1).argmax(axis=1)
@@ -364,12 +389,12 @@ def _reversed_where_given_so(direction: Floats, given: Floats) -> Floats:
     return np.where(backwards[:, None], wrap_angle(direction + np.pi), direction)
 
 
-def _carry(values: Floats, observed: Bools) -> Floats:
-    """Fills NaN with the last known value before, else with the first known one after (axis 1)."""
+def _fill_unknown(values: Floats, observed: Bools) -> Floats:
+    """Fill NaN with the last known value before it, else with the first known one after it (axis 1)."""
     frames = np.arange(values.shape[1])[None, :]
     known = np.isfinite(values) & observed
     before = np.maximum.accumulate(np.where(known, frames, -1), axis=1)
     after = np.flip(np.minimum.accumulate(np.flip(np.where(known, frames, values.shape[1]), 1), axis=1), 1)
     source = np.where(before >= 0, before, np.minimum(after, values.shape[1] - 1))
-    carried: Floats = np.take_along_axis(values, source, axis=1)
-    return carried
+    filled: Floats = np.take_along_axis(values, source, axis=1)
+    return filled

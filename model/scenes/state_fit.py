@@ -1,28 +1,30 @@
-"""States fitted to the observations around them: what is seen more often than at 2 Hz is evidence.
+"""States fitted to the observations around a time, where these are denser than 2 Hz.
 
-Around each time asked for, weighted least squares over the observations within ``WINDOW``: positions, and
-velocities and accelerations where they are given, by a constant acceleration; headings by a constant turn
-rate. Weights fall to zero at the window's edge, so that no observation leaves with a step. Observations after
-the present are not there.
+Around each time, a weighted least-squares fit to the observations within ``WINDOW``: positions, and
+velocities and accelerations where given, by a constant acceleration; headings by a constant turn rate.
+Weights fall to zero at the window's edge, so that no observation leaves it with a jump. Observations after
+the present are not used.
 
-How far the observations scatter about the fit says how much is noise. The noisier they are, the more of the
-window counts, the nearer to zero the acceleration stays, and the less the course over ground tells of the
-heading.
+The scatter of the observations about the fit is an estimate of their noise. With more noise, more of the
+window counts, the acceleration stays nearer to zero, and the course over ground says less about the heading.
 
-The constants were chosen by the error now over straight, braking, starting, turning, creeping, standing and
-fast motion, seen at 5, 10 and 20 Hz with 0 to 10 cm and 0 to 0.1 rad of noise: longer windows and stiffer
-accelerations do better at 10 cm and miss the beginning of braking, shorter ones the reverse.
+The steps, in the order of this file: ``_share`` tells where observations are dense enough; ``_fit_motion``
+fits position, velocity and acceleration by normal equations; ``_fit_heading`` fits heading and heading rate.
 
-On 30 other, random motions (2 to 30 m/s, accelerations and turns that change every second or so) the error
-now, as a part of that of single observations and backward differences over 0.5 s: velocity 0.4 without
-noise, 0.5 to 0.6 at 3 cm, 0.7 (20 Hz), 0.8 (10 Hz) and 1.0 (5 Hz: no gain) at 10 cm; acceleration 0.8 to
-0.9; position 0.6 to 0.96 with noise; heading 0.6 to 0.7 at 0.02 rad, 0.3 to 0.4 at 0.1 rad; heading rate
-0.3 to 0.5 at 0.1 rad, no gain (0.95 to 1.1) below. Half a second before the present, with observations on
-both sides, velocity 0.2 to 0.4 and acceleration 0.4. Exact observations lose: the position is up to 2 cm
-(RMS) beside them, the heading 0.008 rad.
+The constants minimise the error now over straight, braking, starting, turning, creeping, standing and fast
+motion, observed at 5, 10 and 20 Hz with 0 to 10 cm and 0 to 0.1 rad of noise. Longer windows and stiffer
+accelerations are better at 10 cm and miss the beginning of braking; shorter ones are the reverse.
 
-Without noise, arcs of up to 4 m/s² across, with headings, are met to 0.2 m/s and 0.02 rad. For a third of a
-second after a sudden change of the acceleration by 1 m/s² the velocity is up to 0.15 m/s off.
+Errors now on 30 other, random motions (2 to 30 m/s, accelerations and turns that change every second or so),
+as a part of those of single observations and backward differences over 0.5 s: velocity 0.4 without noise, 0.5
+to 0.6 at 3 cm, 0.7 (20 Hz), 0.8 (10 Hz) and 1.0 (5 Hz: no gain) at 10 cm; acceleration 0.8 to 0.9; position
+0.6 to 0.96 with noise; heading 0.6 to 0.7 at 0.02 rad, 0.3 to 0.4 at 0.1 rad; heading rate 0.3 to 0.5 at 0.1
+rad, no gain (0.95 to 1.1) below. Half a second before the present, with observations on both sides, velocity
+0.2 to 0.4 and acceleration 0.4. Exact observations lose accuracy: the position is up to 2 cm (RMS) off, the
+heading 0.008 rad.
+
+Without noise, arcs of up to 4 m/s² across, with headings, are fitted to 0.2 m/s and 0.02 rad. For a third of
+a second after a sudden change of the acceleration by 1 m/s², the velocity is up to 0.15 m/s off.
 """
 
 from dataclasses import dataclass
@@ -37,47 +39,50 @@ from model.scenes.observations import Observations
 from model.scenes.scene import STEP_SECONDS
 
 WINDOW = 1.05
-"""s; observations this far from a time no longer count for it: what lies before too wide a gap never does."""
+"""s; only observations nearer to a time than this count for it: none before too wide a gap does."""
 MIN_HEADING_SPEED = 0.5
-"""m/s; the direction of motion tells the heading from this speed on."""
+"""m/s; from this speed on, the direction of motion determines the heading."""
 
-# The noisier observations are, the more of the window counts: from the narrow window without noise halfway to
-# the whole one at this noise.
+# The effective window grows with the noise: it is the narrow one without noise, and midway between the narrow
+# and the whole one at _HALF_NOISE.
 _NARROW_WINDOW = 0.6  # s
 _HALF_NOISE = 0.1  # m
 
-# The fit takes over, gradually, as observations are denser than on the grid: by the summed weights, in units
-# of what 2 Hz would bring, and by their standard deviation in time.
+# The fit takes over gradually as observations become denser than the grid: by their summed weights, in units
+# of those at 2 Hz, and by their standard deviation in time.
 _SPARSE, _DENSE = 1.35, 1.75
 _SHORT, _LONG = 0.02, 0.07  # s
 
-# Assumed of noise where too few observations tell it; they count like so many more
+# Prior of the noise, worth that many observations
 _POSITION_NOISE = 0.03  # m
 _HEADING_NOISE = 0.05  # rad
 _ASSUMED_COUNT = 0.3
-# Noise of given derivatives, as parts of that of positions and headings
+# Noise of given derivatives, relative to the noise of positions and headings
 _VELOCITY_PER_POSITION = 4.0  # m/s for each m
 _ACCELERATION_PER_POSITION = 16.0  # m/s² for each m
 _RATE_PER_HEADING = 2.0  # rad/s for each rad
 
-# What agents usually do: standard deviations about zero
+# Priors of acceleration and heading rate: standard deviations about zero
 _USUAL_ACCELERATION = 1.7  # m/s²
 _USUAL_RATE = 0.4  # rad/s
 
-# Course and heading: the course counts from the one speed on, fully from the other
+# The course measures the heading from the first speed on, with full weight from the second
 _COURSE_FROM, _COURSE_FULLY = 2.0, 4.0  # m/s
 _SLIP = 0.02  # rad, between the course and the heading of an agent that drives straight on
-_REAR_AXLE = 1.4  # m, behind the middle, whose course is the heading; the middle's own differs in a turn
+_REAR_AXLE = 1.4  # m behind the middle: there, course and heading agree; in a turn, they differ at the middle
 _COURSE_RATE_NOISE = 0.02  # rad/s
-# Which way round a heading is, the headings vote, each with its weight, and the motion with this part of
-# theirs: it breaks the tie of a flipped frame; from some 6 m/s on, which nobody drives backwards, it decides.
+# Flipped headings (by half a turn) are outvoted: each heading votes with its weight, and the course with this
+# share of their sum. The course breaks ties; from some 6 m/s on, at which nobody reverses, it decides.
 _VOTE_AT_REVERSE, _REVERSE_SPEED, _VOTE_PER_SPEED = 0.9, 6.0, 0.6
-_CUTS = (1.5, 0.5)  # rad; a heading further from the fit is an outlier: coarsely at first, then finely
+_OUTLIER_CUTS = (
+    1.5,
+    0.5,
+)  # rad; headings farther from the fit are outliers: first a coarse cut, then a fine one
 
 _MOTION_VARIANCES = 6.0
-"""A velocity whose square is this many of its variances has a direction: 95 % of mere noise has none."""
+"""A velocity has a direction if its square exceeds this many of its variances; 95 % of noise does not."""
 _FACTORIALS = (1, 1, 2)
-_ROUNDING = 1e-9  # keeps divisors from zero
+_ROUNDING = 1e-9  # keeps divisors above zero
 
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
@@ -85,10 +90,10 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 
 @dataclass(frozen=True)
 class FittedStates:
-    """States of N agents at E times. Where the share is 0, the other values mean nothing."""
+    """Fitted states of N agents at E times. Where the share is 0, the other values are meaningless."""
 
     share: Floats
-    """[N, E], from 0 (too few observations to fit) to 1 (dense ones): how far the fit is to be taken."""
+    """[N, E], weight of the fit against the states as observed, from 0 (sparse observations) to 1 (dense)."""
     position: Floats
     """[N, E, 2], m."""
     velocity: Floats
@@ -100,15 +105,15 @@ class FittedStates:
     heading_rate: Floats
     """[N, E], rad/s."""
     course: Floats
-    """[N, E], rad, direction of motion; NaN where it is too slow, or lost in the noise."""
+    """[N, E], rad, direction of motion; NaN where the agent is too slow or its motion is within the noise."""
 
 
 @dataclass(frozen=True)
 class _Motion:
-    """Positions and their derivatives, and what they tell of headings. All [E, N] but for the first three."""
+    """Fitted motion, and its implications for the heading. All [E, N], except for the first three."""
 
     position: Floats
-    """[2, E, N], m, from the agent's origin."""
+    """[2, E, N], m, relative to the agent's origin."""
     velocity: Floats
     """[2, E, N], m/s."""
     acceleration: Floats
@@ -118,41 +123,41 @@ class _Motion:
     course: Floats
     """rad, direction of the velocity."""
     course_known: Bools
-    """Whether the velocity is more than noise, and fast enough to have a direction."""
+    """Whether the velocity is fast enough, and enough above the noise, to have a direction."""
     course_rate: Floats
     """rad/s."""
     course_variance: Floats
-    """rad², of the course as a measurement of the heading."""
+    """rad², variance of the course as a measurement of the heading."""
     rate_variance: Floats
-    """rad²/s², of its rate as one of the heading rate."""
+    """rad²/s², variance of the course rate as a measurement of the heading rate."""
     narrowed: Floats
-    """0 to 1, the part of the narrow window in the fit."""
+    """Share of the narrow window in the fit, from 0 to 1."""
 
     @property
     def weight(self) -> Floats:
-        """0 to 1, how far the course counts as a measurement of the heading."""
+        """Weight of the course as a measurement of the heading, from 0 to 1."""
         weight: Floats = np.clip((self.speed - _COURSE_FROM) / (_COURSE_FULLY - _COURSE_FROM), 0.0, 1.0)
         return weight
 
 
 def fit_states(obs: Observations, times: Floats) -> FittedStates:
-    """Fits states.
+    """Fit states to observations.
 
     Args:
-        obs: N agents; what lies after the present has been taken out of them.
-        times: [N, E], s, when the states are wanted.
+        obs: observations of N agents, none after the present.
+        times: [N, E], s, times of the states.
     """
-    # [S, E, N] throughout: sums over observations add up in their order, whatever the padding behind them,
-    # and agents, of which there are most, lie side by side
-    time = _first_axis(obs.time)
+    # [S, E, N] throughout: sums over observations then add up in their order, independent of the padding, and
+    # agents, the longest axis, are contiguous
+    time = _observations_first(obs.time)
     seen = np.isfinite(time)
     after = np.where(seen, time, 0.0) - times.T
     squared = np.where(seen, after**2, np.inf)
     wide = np.maximum(1.0 - squared / WINDOW**2, 0.0)
-    total = _total(wide)
-    share = _share(obs, times, total, _total(wide * after), _total(wide * np.where(seen, squared, 0.0)))
+    total = _sum(wide)
+    share = _share(obs, times, total, _sum(wide * after), _sum(wide * np.where(seen, squared, 0.0)))
     if not (share > 0).any():
-        return _nothing(times.shape)
+        return _no_fit(times.shape)
     narrow = np.maximum(1.0 - squared / _NARROW_WINDOW**2, 0.0)
 
     origin = obs.position[:, 0]
@@ -161,7 +166,7 @@ def fit_states(obs: Observations, times: Floats) -> FittedStates:
     usual = _USUAL_RATE**2 / (_USUAL_RATE**2 + motion.rate_variance)
     heading_rate = np.where(motion.course_known, motion.course_rate * usual, 0.0)
     weight = wide + motion.narrowed * (narrow - wide)
-    given = np.where(_first_axis(np.isfinite(obs.heading)), weight, 0.0)
+    given = np.where(_observations_first(np.isfinite(obs.heading)), weight, 0.0)
     some = given.any(axis=0)
     if some.any():
         fitted_heading, fitted_rate = _fit_heading(obs, given, weight, after, motion)
@@ -178,148 +183,65 @@ def fit_states(obs: Observations, times: Floats) -> FittedStates:
     )
 
 
-def _nothing(shape: tuple[int, ...]) -> FittedStates:
+def _no_fit(shape: tuple[int, ...]) -> FittedStates:
+    """Return states of share 0: [N, E]."""
     zero, vectors = np.zeros(shape), np.zeros((*shape, 2))
     unknown = np.full(shape, np.nan)
     return FittedStates(zero, vectors, vectors, vectors, unknown, zero, unknown)
 
 
-def _first_axis(values: NDArray[_Scalar]) -> NDArray[_Scalar]:
-    """[N, S] → [S, 1, N]."""
+def _observations_first(values: NDArray[_Scalar]) -> NDArray[_Scalar]:
+    """Move the observations to the first axis: [N, S] → [S, 1, N]."""
     return np.ascontiguousarray(values.T)[:, None, :]
 
 
-def _total(values: Floats) -> Floats:
+def _sum(values: Floats) -> Floats:
     """Sum over the observations: [S, …] → […]."""
     total: Floats = np.add.reduce(values, axis=0)
     return total
 
 
 def _share(obs: Observations, times: Floats, total: Floats, first: Floats, second: Floats) -> Floats:
-    """[E, N], how far observations are dense enough for a fit.
+    """Return the share of the fit, by the density of the observations: [E, N], 0 to 1.
 
     Args:
-        obs: N agents.
-        times: [N, E], s.
+        obs: observations of N agents.
+        times: [N, E], s, times of the states.
         total: [E, N], summed weights.
-        first: [E, N], s, summed weights · times after ``times``.
-        second: [E, N], s², likewise of the squares.
+        first: [E, N], s, sum of weights · (times of observations − ``times``).
+        second: [E, N], s², sum of weights · squares of the same.
     """
     some = np.maximum(total, 1e-9)
     spread = np.sqrt(np.maximum(second / some - (first / some) ** 2, 0.0))
     newest = obs.time[np.arange(len(obs.count)), obs.count - 1]
     steps = np.arange(STEP_SECONDS, WINDOW, STEP_SECONDS)
     neighbors = 1.0 - (steps / WINDOW) ** 2
-    there = newest - times.T[..., None, :] > steps[:, None] - STEP_SECONDS / 2  # [E, steps, N], behind
+    there = (
+        newest - times.T[..., None, :] > steps[:, None] - STEP_SECONDS / 2
+    )  # [E, steps, N]; after the state
     sparse = 1.0 + neighbors.sum() + (neighbors[:, None] * there).sum(axis=-2)
     dense = np.clip((total / sparse - _SPARSE) / (_DENSE - _SPARSE), 0.0, 1.0)
     share: Floats = dense * np.clip((spread - _SHORT) / (_LONG - _SHORT), 0.0, 1.0)
     return share
 
 
-class _Equations:
-    """Normal equations of a constant acceleration along both axes: what is sought is position, velocity and
-    acceleration at W times.
-
-    Args:
-        weight: [S, W, N].
-        after: [S, W, N], s, observations' times after them.
-    """
-
-    def __init__(self, weight: Floats, after: Floats) -> None:
-        self._weight = weight
-        self._after = after
-        shape = weight.shape[1:]
-        self.information = np.zeros((3, 3, *shape))
-        """Its upper triangle."""
-        self.sides = np.zeros((3, 2, *shape))
-        self.squares = np.zeros(shape)
-        self.count = np.zeros(shape)
-        """Summed weights of all measurements."""
-
-    def add(self, values: Floats, order: int, noise: float) -> None:
-        """Adds measurements.
-
-        Args:
-            values: [N, S, 2], NaN where not given, of derivatives of the position.
-            order: which derivative.
-            noise: theirs, in units of the positions'.
-        """
-        given = np.isfinite(values[..., 0])  # both components, or neither
-        if not given.any():
-            return
-        unknowns = 3 - order
-        weights = [self._weight if given.all() else np.where(_first_axis(given), self._weight, 0.0)]
-        for _ in range(2 * unknowns - 2):
-            weights.append(weights[-1] * self._after)
-        moments = [_total(weight) for weight in weights]
-        self.count += moments[0]
-        for i in range(unknowns):
-            for j in range(i, unknowns):
-                moment = moments[i + j] / (_FACTORIALS[i] * _FACTORIALS[j] * noise**2)
-                self.information[order + i, order + j] += moment
-        columns = [_first_axis(np.where(given, values[..., axis], 0.0)) for axis in (0, 1)]
-        for i in range(unknowns):
-            for axis, column in enumerate(columns):
-                self.sides[order + i, axis] += _total(weights[i] * column) / (_FACTORIALS[i] * noise**2)
-        self.squares += _total(weights[0] * (columns[0] ** 2 + columns[1] ** 2)) / noise**2
-
-
-class _Solution:
-    """Of normal equations, which are factored as L D Lᵀ.
-
-    Args:
-        information: [3, 3, E, N].
-        sides: [3, 2, E, N].
-    """
-
-    def __init__(self, information: Floats, sides: Floats) -> None:
-        i00, i01, i02 = information[0]
-        self._l10, self._l20 = i01 / i00, i02 / i00
-        left = information[1, 2] - self._l10 * i02
-        self._d0, self._d1 = i00, information[1, 1] - self._l10 * i01
-        self._l21 = left / self._d1
-        self._d2 = np.maximum(information[2, 2] - self._l20 * i02 - self._l21 * left, 0.0)
-        self._first = sides[0]
-        self._second = sides[1] - self._l10 * self._first
-        self._third = sides[2] - self._l20 * self._first - self._l21 * self._second
-
-    def explained(self) -> Floats:
-        """[E, N], by how much the fit lowers the sum of squares."""
-        last = self._third**2 / (self._d2 + _ROUNDING)
-        explained: Floats = (self._first**2 / self._d0 + self._second**2 / self._d1 + last).sum(axis=0)
-        return explained
-
-    def solve(self, noise: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-        """Position, velocity and acceleration [2, E, N], and the variances of the last two, either axis', if
-        accelerations are the usual ones beforehand.
-
-        Args:
-            noise: [E, N], m², variance of a position of weight 1.
-        """
-        d2 = self._d2 + noise / _USUAL_ACCELERATION**2
-        acceleration = self._third / d2
-        velocity = self._second / self._d1 - self._l21 * acceleration
-        position = self._first / self._d0 - self._l10 * velocity - self._l20 * acceleration
-        acceleration_variance = noise / d2
-        velocity_variance = noise / self._d1 + self._l21**2 * acceleration_variance
-        return position, velocity, acceleration, velocity_variance, acceleration_variance
-
-
 def _fit_motion(
     obs: Observations, origin: Floats, wide: Floats, narrow: Floats, after: Floats, wanted: Bools
 ) -> _Motion:
-    """Fits a constant acceleration.
+    """Fit a constant acceleration.
 
     Args:
-        obs: N agents.
-        origin: [N, 2], m, somewhere near.
+        obs: observations of N agents.
+        origin: [N, 2], m, a point near each agent.
         wide: [S, E, N], weights in the whole window.
-        narrow: [S, E, N], in the narrow one.
-        after: [S, E, N], s, observations' times after the states'.
-        wanted: [E, N]; elsewhere the equations may have no solution.
+        narrow: [S, E, N], weights in the narrow window.
+        after: [S, E, N], s, times of the observations relative to the states'.
+        wanted: [E, N], states to fit; elsewhere the equations may be singular.
     """
-    equations = _Equations(np.concatenate([wide, narrow], axis=1), np.concatenate([after, after], axis=1))
+    # Both windows at once, one behind the other along the axis of the states
+    equations = _NormalEquations(
+        np.concatenate([wide, narrow], axis=1), np.concatenate([after, after], axis=1)
+    )
     equations.add(obs.position - origin[:, None], 0, 1.0)
     equations.add(obs.velocity, 1, _VELOCITY_PER_POSITION)
     equations.add(obs.acceleration, 2, _ACCELERATION_PER_POSITION)
@@ -327,12 +249,13 @@ def _fit_motion(
     information = np.where(wanted, equations.information[:, :, :frames], np.eye(3)[:, :, None, None])
     sides = equations.sides[:, :, :frames]
 
-    # Both axes have three numbers each; what the rest scatters is noise
+    # The noise is the scatter about the fit, which has three parameters along each axis
     explained = _Solution(information, sides).explained()
     scatter = np.maximum(equations.squares[:frames] - explained, 0.0)
     rest = np.maximum(2 * equations.count[:frames] - 6, 0.0)
     noise = (scatter + _ASSUMED_COUNT * _POSITION_NOISE**2) / (rest + _ASSUMED_COUNT)
 
+    # The less noise, the more the equations of the narrow window count
     narrowed = _HALF_NOISE**2 / (_HALF_NOISE**2 + noise)
     information = information + narrowed * wanted * (equations.information[:, :, frames:] - information)
     sides = sides + narrowed * (equations.sides[:, :, frames:] - sides)
@@ -358,62 +281,158 @@ def _fit_motion(
     )
 
 
+class _NormalEquations:
+    """The normal equations of a constant acceleration along both axes, in W windows.
+
+    The unknowns are position, velocity and acceleration at the window's time.
+
+    Args:
+        weight: [S, W, N], weights of the observations.
+        after: [S, W, N], s, times of the observations relative to the window's.
+    """
+
+    def __init__(self, weight: Floats, after: Floats) -> None:
+        self._weight = weight
+        self._after = after
+        shape = weight.shape[1:]
+        self.information = np.zeros((3, 3, *shape))
+        """[3, 3, W, N], the matrix of the equations; only its upper triangle is set."""
+        self.sides = np.zeros((3, 2, *shape))
+        """[3, 2, W, N], the right-hand sides along both axes."""
+        self.squares = np.zeros(shape)
+        """[W, N], weighted sum of squares of all measurements."""
+        self.count = np.zeros(shape)
+        """[W, N], summed weights of all measurements."""
+
+    def add(self, values: Floats, order: int, noise: float) -> None:
+        """Add measurements of a derivative of the position.
+
+        Args:
+            values: [N, S, 2], NaN where not given.
+            order: order of the derivative, 0 for positions.
+            noise: noise of the measurements, relative to the noise of positions.
+        """
+        given = np.isfinite(values[..., 0])  # both components, or neither
+        if not given.any():
+            return
+        unknowns = 3 - order
+        weights = [self._weight if given.all() else np.where(_observations_first(given), self._weight, 0.0)]
+        for _ in range(2 * unknowns - 2):
+            weights.append(weights[-1] * self._after)
+        moments = [_sum(weight) for weight in weights]
+        self.count += moments[0]
+        for i in range(unknowns):
+            for j in range(i, unknowns):
+                moment = moments[i + j] / (_FACTORIALS[i] * _FACTORIALS[j] * noise**2)
+                self.information[order + i, order + j] += moment
+        columns = [_observations_first(np.where(given, values[..., axis], 0.0)) for axis in (0, 1)]
+        for i in range(unknowns):
+            for axis, column in enumerate(columns):
+                self.sides[order + i, axis] += _sum(weights[i] * column) / (_FACTORIALS[i] * noise**2)
+        self.squares += _sum(weights[0] * (columns[0] ** 2 + columns[1] ** 2)) / noise**2
+
+
+class _Solution:
+    """The solution of normal equations, factored as L D Lᵀ.
+
+    Args:
+        information: [3, 3, E, N], the matrix, upper triangle.
+        sides: [3, 2, E, N], the right-hand sides.
+    """
+
+    def __init__(self, information: Floats, sides: Floats) -> None:
+        i00, i01, i02 = information[0]
+        self._l10, self._l20 = i01 / i00, i02 / i00
+        left = information[1, 2] - self._l10 * i02
+        self._d0, self._d1 = i00, information[1, 1] - self._l10 * i01
+        self._l21 = left / self._d1
+        self._d2 = np.maximum(information[2, 2] - self._l20 * i02 - self._l21 * left, 0.0)
+        self._first = sides[0]
+        self._second = sides[1] - self._l10 * self._first
+        self._third = sides[2] - self._l20 * self._first - self._l21 * self._second
+
+    def explained(self) -> Floats:
+        """Return the reduction of the sum of squares by the fit, without a prior: [E, N]."""
+        last = self._third**2 / (self._d2 + _ROUNDING)
+        explained: Floats = (self._first**2 / self._d0 + self._second**2 / self._d1 + last).sum(axis=0)
+        return explained
+
+    def solve(self, noise: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+        """Solve for position, velocity and acceleration [2, E, N], with the prior of the acceleration.
+
+        Also return the variances of velocity and acceleration [E, N], which are the same for both axes.
+
+        Args:
+            noise: [E, N], m², variance of a position of weight 1.
+        """
+        d2 = self._d2 + noise / _USUAL_ACCELERATION**2
+        acceleration = self._third / d2
+        velocity = self._second / self._d1 - self._l21 * acceleration
+        position = self._first / self._d0 - self._l10 * velocity - self._l20 * acceleration
+        acceleration_variance = noise / d2
+        velocity_variance = noise / self._d1 + self._l21**2 * acceleration_variance
+        return position, velocity, acceleration, velocity_variance, acceleration_variance
+
+
 def _fit_heading(
     obs: Observations, given: Floats, weight: Floats, after: Floats, motion: _Motion
 ) -> tuple[Floats, Floats]:
-    """Fits headings that turn at a constant rate, to the given ones and to the course over ground.
+    """Fit headings of a constant turn rate to the given headings and to the course over ground.
 
     Args:
-        obs: N agents.
-        given: [S, E, N], the weight of what gives a heading, else 0.
-        weight: [S, E, N].
-        after: [S, E, N], s, observations' times after the states'.
-        motion: the agents'.
+        obs: observations of N agents.
+        given: [S, E, N], weights of observations with a heading, else 0.
+        weight: [S, E, N], weights of all observations.
+        after: [S, E, N], s, times of the observations relative to the states'.
+        motion: the fitted motion.
 
     Returns:
-        [E, N] rad, and rad/s; meaningless where no heading is given.
+        Heading [E, N], rad, and heading rate [E, N], rad/s; meaningless where no heading is given.
     """
-    angle = _first_axis(np.nan_to_num(obs.heading))
-    # Which way round: a vote, which one flipped frame does not change
+    angle = _observations_first(np.nan_to_num(obs.heading))
+    # A rough heading by vote, which a single flipped heading does not change
     by_speed = (motion.speed - _COURSE_FROM) / (_REVERSE_SPEED - _COURSE_FROM)
     faster = np.maximum(motion.speed - _REVERSE_SPEED, 0.0)
     vote = _VOTE_AT_REVERSE * np.clip(by_speed, 0.0, 1.0) + _VOTE_PER_SPEED * np.minimum(faster, 1.0)
-    vote *= _total(given)
+    vote *= _sum(given)
     near = np.arctan2(
-        _total(given * np.sin(angle)) + vote * np.sin(motion.course),
-        _total(given * np.cos(angle)) + vote * np.cos(motion.course),
+        _sum(given * np.sin(angle)) + vote * np.sin(motion.course),
+        _sum(given * np.cos(angle)) + vote * np.cos(motion.course),
     )
     off = angle - near
     off -= 2 * np.pi * np.rint(off / (2 * np.pi))
     course = wrap_angle(motion.course - near)
-    course = np.where(np.abs(course) > np.pi / 2, wrap_angle(course + np.pi), course)  # it reverses
+    course = np.where(np.abs(course) > np.pi / 2, wrap_angle(course + np.pi), course)  # reversing
 
-    # What is known beside the headings: usual rates, given ones, the course and its rate
+    # Information beside the headings: the prior of the rate, given rates, the course and its rate
     rate_noise = motion.weight / motion.rate_variance
     rate_information = 1.0 / _USUAL_RATE**2 + rate_noise
     rate_side = rate_noise * motion.course_rate
     rate_given = np.isfinite(obs.heading_rate)
     if rate_given.any():
-        rates = np.where(_first_axis(rate_given), weight, 0.0) / (_RATE_PER_HEADING * _HEADING_NOISE) ** 2
-        rate_information = rate_information + _total(rates)
-        rate_side = rate_side + _total(rates * _first_axis(np.nan_to_num(obs.heading_rate)))
+        rates = (
+            np.where(_observations_first(rate_given), weight, 0.0) / (_RATE_PER_HEADING * _HEADING_NOISE) ** 2
+        )
+        rate_information = rate_information + _sum(rates)
+        rate_side = rate_side + _sum(rates * _observations_first(np.nan_to_num(obs.heading_rate)))
     course_information = motion.weight / motion.course_variance
 
+    # Least squares for heading and rate, without outliers; after the coarse pass, the scatter tells the noise
     noise = np.full(near.shape, _HEADING_NOISE**2)
     turned, rate = np.zeros_like(near), np.zeros_like(near)
-    for cut in _CUTS:
+    for cut in _OUTLIER_CUTS:
         left = off - (turned + rate * after)
         trusted = given * np.maximum(1.0 - (left / cut) ** 2, 0.0) ** 2
         once = trusted * after
-        count = _total(trusted)
-        if cut != _CUTS[0]:
-            scatter = _total(trusted * left**2)
+        count = _sum(trusted)
+        if cut != _OUTLIER_CUTS[0]:
+            scatter = _sum(trusted * left**2)
             noise = (scatter + _ASSUMED_COUNT * _HEADING_NOISE**2) / (count + _ASSUMED_COUNT)
         i00 = count / noise + course_information + _ROUNDING
-        i01 = _total(once) / noise
-        i11 = _total(once * after) / noise + rate_information
-        side0 = _total(trusted * off) / noise + course_information * course
-        side1 = _total(once * off) / noise + rate_side
+        i01 = _sum(once) / noise
+        i11 = _sum(once * after) / noise + rate_information
+        side0 = _sum(trusted * off) / noise + course_information * course
+        side1 = _sum(once * off) / noise + rate_side
         determinant = i00 * i11 - i01**2
         turned = (i11 * side0 - i01 * side1) / determinant
         rate = (i00 * side1 - i01 * side0) / determinant
