@@ -6,9 +6,14 @@ import numpy as np
 
 from model.arrays import Floats, Ints
 from model.data.scenes import SceneRecord
-from model.metrics.ages import complete, forecasts_by_age
-from model.metrics.convergence import RANGES_M, convergence_s, errors_by_age_m
-from model.metrics.dispersion import dispersion
+from model.metrics.consistency import (
+    RANGES_M,
+    complete,
+    convergence_s,
+    dispersion,
+    errors_by_age_m,
+    forecasts_by_age,
+)
 
 METRICS = (
     "dispersion_std_m",

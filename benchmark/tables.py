@@ -15,7 +15,7 @@ from model.evaluation.published import (
 from model.evaluation.tables import MERGED, MERGED_NOTE, STOOD_NOTE, WITHOUT_STANDING
 from model.evaluation.text_tables import Table, document, metrics_table, number, signed
 from model.forecaster import Protocol
-from model.metrics.convergence import RANGES_M
+from model.metrics.consistency import RANGES_M
 from model.metrics.displacement import HORIZONS_S
 from model.metrics.hard import HARD_SHARES
 from model.metrics.multimodal import MISS_TOLERANCE_M, TOP_K

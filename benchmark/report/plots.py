@@ -16,7 +16,7 @@ from cab_forecast.plot_style import INK
 from model.arrays import Floats
 from model.evaluation.published import published_figures
 from model.forecaster import Protocol
-from model.metrics.convergence import RANGES_M
+from model.metrics.consistency import RANGES_M
 from model.metrics.displacement import HORIZONS_S
 
 _PAPER = {"cab": (0, (5.0, 2.0)), "trajectron": (0, (2.0, 2.0))}

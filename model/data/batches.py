@@ -1,4 +1,4 @@
-"""Batches of a cache's pairs on a device, as ``model.features.scene_features`` would make them."""
+"""Batches of a cache's pairs on a device, with the features of ``model.features.scene_features``."""
 
 from collections.abc import Sequence
 
@@ -20,7 +20,7 @@ from model.scenes.scene import AgentType
 
 
 class Batches:
-    """Features and truths of any pairs, without a loop over them."""
+    """Features and futures of a cache's pairs, gathered without a loop over them."""
 
     def __init__(
         self,
@@ -32,14 +32,14 @@ class Batches:
         """
         Args:
             cache: the pairs.
-            device: where batches are made and stay; on a GPU all of the cache is copied there but for map
-                patches of the agents' frames.
-            config: what the network looks at, for a network that sees less than is there; None: all.
-            packed_maps: leave map patches of the agent's frame packed, three layers a byte: augmentation
-                then moves a twelfth of the memory, and ``packing.unpack_patches`` is the caller's.
+            device: device of the batches; a GPU gets a copy of the whole cache, except for map patches of the
+                agents' frames.
+            config: configuration of a network that may see less than the cache holds; None: everything.
+            packed_maps: leave map patches of the agent's frame packed, three layers a byte. Perturbations
+                then move a twelfth of the memory, and the caller has to call ``packing.unpack_patches``.
 
         Raises:
-            DataError: the cache was made for other neighbours than the network's.
+            DataError: the cache does not hold the features of the network.
         """
         key = cache.manifest.key
         known = key.neighbor_types
@@ -86,7 +86,7 @@ class Batches:
         self._device = device
 
     def __len__(self) -> int:
-        """P, how many pairs there are."""
+        """Return P, the number of pairs."""
         return len(self._future) // (1 + self.variants)
 
     @property
@@ -105,10 +105,10 @@ class Batches:
         return self._paths
 
     def batch(self, indices: Tensor, turns: Tensor | None = None) -> tuple[Features, Tensor]:
-        """``features``, with the surroundings of each pair turned.
+        """Return features and futures of pairs, rotated if wanted, as ``features`` does of rows.
 
         Args:
-            indices: [n] int64, each in [0, P), on any device. Of a pair with variants one row is drawn.
+            indices: [n] int64, each in [0, P), on any device. For a pair with variants one row is drawn.
             turns: [n] rad, counter-clockwise, on any device; None: not at all.
         """
         if self.variants:
@@ -119,7 +119,7 @@ class Batches:
         return (features, future) if turns is None else rotate(features, future, turns.to(self._device))
 
     def features(self, indices: Tensor) -> tuple[Features, Tensor]:
-        """Return features and futures of rows of the cache: the pairs, and behind each its variants.
+        """Return features and futures of rows of the cache: each pair is followed by its variants.
 
         Args:
             indices: [n] int64, on any device.
@@ -134,17 +134,17 @@ class Batches:
         if self._cut is not None:
             features["map"] = self._cut(indices)
         for name, packed in self._packed.items():
-            # On a CPU the file is read as it is needed
+            # The file is read on demand, so indexing is on the CPU
             here = packed[indices.cpu()].to(self._device)
             features[name] = here if self._keeps_packed else unpack_patches(here)
         return features, self._future.index_select(0, indices)
 
 
 STOOD_M = 0.5
-"""m; who moved less for as long as it was seen stood. That is more than the metrics count
-(``model.metrics.standing``): who was seen for less than 2 s, or from farther away, may stand, too."""
+"""m; an agent that moved less for as long as it was seen stood. This includes more agents than the rule of
+the metrics (``model.metrics.standing``): those seen for less than 2 s, or from far away, may stand, too."""
 LEFT_M = 2.0
-"""m; who is farther away than that after 6 s has left."""
+"""m; an agent that is farther away after 6 s has left."""
 RECORDED_SHARE = 0.4
 """Share of the pairs with variants that a batch shows as recorded."""
 
@@ -152,8 +152,8 @@ RECORDED_SHARE = 0.4
 def _leaving(cache: Cache) -> Bools:
     """Return which pairs stood for as long as they were seen, and are elsewhere after 6 s: [P].
 
-    The end counts, because the prediction challenge has no pair that stands to the end: those that are still
-    there after 3 s are about to leave. Who was seen in one frame only does not count: it may be driving.
+    The position after 6 s decides, because the prediction challenge has no pair that stands to the end: those
+    still there after 3 s are about to leave. Agents seen in one frame only do not count: they may be driving.
     """
     rows = slice(None, None, 1 + cache.manifest.key.variants)
     before, end = cache.observed_positions()[rows], cache.future[rows, -1]
@@ -163,7 +163,7 @@ def _leaving(cache: Cache) -> Bools:
 
 
 def _packed_patches(cache: Cache, config: AnyNetworkConfig | None) -> dict[str, Tensor]:
-    """Return the packed map patches that a network of the agent's frame looks at, by feature."""
+    """Return the packed map patches that a network of the agent's frame uses, by feature."""
     near = config is None or config.uses_map
     far = config is None or (isinstance(config, NetworkConfig) and config.far_map)
     arrays = {"map": cache.near_patch if near else None, "far_map": cache.far_patch if far else None}
@@ -171,10 +171,10 @@ def _packed_patches(cache: Cache, config: AnyNetworkConfig | None) -> dict[str, 
 
 
 class JoinedPairs:
-    """The pairs of several sources, one source behind the other; a ``BatchSource``.
+    """The concatenated pairs of several sources; a ``BatchSource``.
 
     Args:
-        sources: at least one, whose features have the same names.
+        sources: at least one source; their features have the same names.
     """
 
     def __init__(self, sources: Sequence[Batches]) -> None:
@@ -188,17 +188,17 @@ class JoinedPairs:
 
     @property
     def turned(self) -> Tensor:
-        """[P], as of ``Batches``."""
+        """[P], as in ``Batches``."""
         return torch.cat([one.turned for one in self._sources])
 
     @property
     def leaving(self) -> Tensor:
-        """[P], as of ``Batches``."""
+        """[P], as in ``Batches``."""
         return self._leaving
 
     @property
     def paths(self) -> Tensor:
-        """[P, 12, 2], as of ``Batches``."""
+        """[P, 12, 2], as in ``Batches``."""
         return torch.cat([one.paths for one in self._sources])
 
     def batch(self, indices: Tensor, turns: Tensor | None = None) -> tuple[Features, Tensor]:

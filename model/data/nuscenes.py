@@ -1,6 +1,6 @@
 """Reader of nuScenes itself, through nuscenes-devkit.
 
-The devkit needs numpy < 2 and much else, so it is loaded when a reader is made and never before.
+The devkit needs numpy < 2 and many other packages, so it is imported only when a reader is made.
 """
 
 import json
@@ -21,9 +21,9 @@ from model.data.scenes import DataError, Pair, SceneRecord, Track
 from model.scenes.scene import AgentType, Raster
 
 EGO = "ego"
-"""Id of the track of the car that recorded."""
+"""Id of the recording car's track."""
 MARGIN = 50.0
-"""m of map around the tracks of a scene: a patch reaches 34.3 m."""
+"""m of map around the tracks of a scene; a patch reaches 34.3 m."""
 
 _VERSIONS = {
     "mini_train": "v1.0-mini",
@@ -35,13 +35,13 @@ _VERSIONS = {
     "mini_val_standing": "v1.0-mini",
 }
 _STANDING = {"mini_train_standing": "mini_train", "mini_val_standing": "mini_val"}
-"""Splits of standing vehicles, and the official splits whose scenes they look at."""
+"""Splits of standing vehicles, and the official splits whose scenes they use."""
 _HELD_BACK = frozenset({"scene-0061"})
-"""Of mini_train, but also of the challenge's train_val: what is judged on is not trained on."""
+"""Scenes of mini_train that are also in the challenge's train_val, and so must not be trained on."""
 _STANDING_STEPS = 4
 """Frames before the present in which a standing vehicle does not move (2 s), and between two of its pairs."""
 _STANDING_METERS = 0.3
-"""What a standing vehicle seems to move at most: annotations are that exact."""
+"""m, maximum apparent movement of a standing vehicle, given the annotations' accuracy."""
 _CATEGORIES = {
     "vehicle.bicycle": AgentType.CYCLIST,
     "vehicle.motorcycle": AgentType.CYCLIST,
@@ -51,12 +51,12 @@ _CATEGORIES = {
     "human.pedestrian.": AgentType.PEDESTRIAN,
     "animal": AgentType.UNKNOWN,
 }
-"""Agent type by the beginning of the category, the first that fits. What moves like no type is UNKNOWN;
-what does not move by itself (barriers, cones, debris, racks) is no agent and left out."""
+"""Agent types by prefixes of the category; the first that fits counts. Agents that move like no other type
+are UNKNOWN; objects that do not move by themselves (barriers, cones, debris, racks) are left out."""
 
 
 class NuscenesReader:
-    """The data set with all its agents: parked vehicles, pedestrians, cyclists and the ego vehicle too.
+    """The data set with all its agents, including parked vehicles, pedestrians, cyclists and the ego vehicle.
 
     Frames are the numbers of a scene's samples, nominally 0.5 s apart; tracks have instance tokens.
     """
@@ -64,7 +64,7 @@ class NuscenesReader:
     def __init__(self, dataroot: Path) -> None:
         """
         Args:
-            dataroot: holds ``v1.0-mini`` or ``v1.0-trainval``, and ``maps`` with the map expansion 1.3.
+            dataroot: folder with ``v1.0-mini`` or ``v1.0-trainval``, and ``maps`` with the map expansion 1.3.
 
         Raises:
             ImportError: nuscenes-devkit is not installed.
@@ -89,19 +89,19 @@ class NuscenesReader:
 
     @property
     def splits(self) -> tuple[str, ...]:
-        """Splits of the prediction challenge, two of them on v1.0-mini, and of standing vehicles.
+        """Splits of the prediction challenge, two of them on v1.0-mini, and splits of standing vehicles.
 
-        The latter have all vehicles but the ego vehicle that stood for 2 s and whose next 6 s are annotated,
-        at frames 2 s apart, moving later or not; no others (the challenge asks for hardly any that stay).
-        ``mini_train_standing`` leaves scene-0061 out, as that one is also of the challenge's train_val.
+        The latter have only vehicles (not the ego vehicle) that stood for 2 s and whose next 6 s are
+        annotated, at frames 2 s apart, moving later or not; the challenge has hardly any that stay.
+        ``mini_train_standing`` leaves out scene-0061, which is also in the challenge's train_val.
         """
         return tuple(_VERSIONS)
 
     def scenes(self, split: str) -> Iterator[SceneRecord]:
-        """The scenes of a split that have pairs, in order of their names.
+        """Yield the scenes of a split that have pairs, in order of their names.
 
         Raises:
-            DataError: no such split, or a file is missing or bad; names it.
+            DataError: there is no such split, or a file is missing or bad; names it.
         """
         if split not in _VERSIONS:
             raise DataError(f"there is no split {split!r}; there are {', '.join(_VERSIONS)}")
@@ -114,10 +114,10 @@ class NuscenesReader:
             records = (self._record(database, helper, scene) for scene in scenes if scene["name"] in names)
             yield from (record for record in records if record.pairs)
             return
-        asked = self._asked(database, split)
+        listed = self._listed(database, split)
         for scene in scenes:
-            if scene["token"] in asked:
-                yield self._record(database, helper, scene, asked[scene["token"]])
+            if scene["token"] in listed:
+                yield self._record(database, helper, scene, listed[scene["token"]])
 
     def _database(self, version: str) -> Any:
         if version not in self._databases:
@@ -128,26 +128,26 @@ class NuscenesReader:
                 self._databases[version] = self._nuscenes(version, str(self._dataroot), verbose=False)
         return self._databases[version]
 
-    def _asked(self, database: Any, split: str) -> dict[str, list[tuple[str, str]]]:
-        """Instance and sample tokens of the pairs, by the token of their scene."""
+    def _listed(self, database: Any, split: str) -> dict[str, list[tuple[str, str]]]:
+        """Return instance and sample tokens of a split's pairs, by the token of their scene."""
         file = self._dataroot / "maps" / "prediction" / "prediction_scenes.json"
         with _naming(file), warnings.catch_warnings():
             warnings.simplefilter("ignore", ResourceWarning)  # the devkit leaves the file open
             tokens = self._challenge(split, str(self._dataroot))
-            asked: dict[str, list[tuple[str, str]]] = defaultdict(list)
+            listed: dict[str, list[tuple[str, str]]] = defaultdict(list)
             for token in tokens:
                 instance, sample = token.split("_")
-                asked[database.get("sample", sample)["scene_token"]].append((instance, sample))
-        return asked
+                listed[database.get("sample", sample)["scene_token"]].append((instance, sample))
+        return listed
 
     def _record(
         self,
         database: Any,
         helper: Any,
         scene: dict[str, Any],
-        asked: Sequence[tuple[str, str]] | None = None,
+        listed: Sequence[tuple[str, str]] | None = None,
     ) -> SceneRecord:
-        """A scene with the pairs asked for, as instance and sample tokens; None: of standing vehicles."""
+        """Return a scene with the listed pairs (instance and sample tokens); None: standing vehicles."""
         where = f"{database.table_root}: {scene['name']}"
         with _naming(where):
             samples = list(_samples(database, scene))
@@ -155,14 +155,14 @@ class NuscenesReader:
             location = helper.get_map_name_from_sample_token(scene["first_sample_token"])
             rows = {track.id: row for row, track in enumerate(tracks)}
             frames = {sample["token"]: frame for frame, sample in enumerate(samples)}
-            if asked is None:
-                asked = [
+            if listed is None:
+                listed = [
                     (track.id, samples[frame]["token"])
                     for track in tracks
                     for frame in _standing_frames(track)
                 ]
             pairs = [
-                Pair(rows[instance], frames[sample], f"{instance}_{sample}") for instance, sample in asked
+                Pair(rows[instance], frames[sample], f"{instance}_{sample}") for instance, sample in listed
             ]
         for track in tracks:
             if not (np.isfinite(track.position).all() and np.isfinite(track.heading).all()):
@@ -190,7 +190,7 @@ def _samples(database: Any, scene: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def _tracks(database: Any, samples: Sequence[dict[str, Any]]) -> list[Track]:
-    """The ego vehicle, then the agents in order of their instance tokens."""
+    """Return the track of the ego vehicle, then those of the agents in order of their instance tokens."""
     frames: dict[str, list[int]] = defaultdict(list)
     poses: dict[str, list[list[float]]] = defaultdict(list)
     types: dict[str, AgentType] = {EGO: AgentType.VEHICLE}
@@ -220,7 +220,7 @@ def _tracks(database: Any, samples: Sequence[dict[str, Any]]) -> list[Track]:
 
 
 def _standing_frames(track: Track) -> list[int]:
-    """Frames at which a vehicle, not the ego vehicle, has stood for 2 s and its next 6 s are known."""
+    """Return frames at which a vehicle, not the ego, has stood for 2 s and its next 6 s are known."""
     chosen: list[int] = []
     if track.type is not AgentType.VEHICLE or track.id == EGO:
         return chosen
@@ -240,7 +240,7 @@ def _agent_type(category: str) -> AgentType | None:
 
 
 def _yaw(quaternion: Floats) -> Floats:
-    """Direction, seen from above, of the turned x axis: [F, 4] (w, x, y, z) → [F], rad."""
+    """Return the direction of the rotated x axis, seen from above: [F, 4] (w, x, y, z) → [F], rad."""
     w, x, y, z = quaternion.T
     yaw: Floats = np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
     return yaw
@@ -248,7 +248,7 @@ def _yaw(quaternion: Floats) -> Floats:
 
 @contextmanager
 def _naming(where: Path | str) -> Iterator[None]:
-    """Turns what the devkit and its tables raise into a ``DataError`` that names a file."""
+    """Convert exceptions of the devkit and its tables into ``DataError`` that names a file."""
     try:
         yield
     except DataError as error:
@@ -266,7 +266,7 @@ def _naming(where: Path | str) -> Iterator[None]:
 
 
 def _broken(where: Path | str) -> Path | str:
-    """The file that is not JSON, of a folder of such."""
+    """Return the first file of a folder that is not JSON."""
     for file in sorted(Path(where).glob("*.json")):
         try:
             json.loads(file.read_bytes())

@@ -1,8 +1,8 @@
 """Rasters from nuScenes' vector maps.
 
-The devkit's own ``get_map_mask`` is not used: it cuts every polygon of the map anew for each patch, and
-fails (with Shapely 2) on dividers that the patch cuts into pieces. Pixels are chosen as it chooses them:
-vertices of areas are rounded, those of dividers cut off, dividers are two pixels wide.
+The devkit's own ``get_map_mask`` is not used: it clips every polygon of the map again for each patch, and
+fails (with Shapely 2) on dividers that the patch cuts into pieces. Pixels are chosen as in the devkit:
+vertices of areas are rounded, those of dividers truncated, dividers are two pixels wide.
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,7 +22,7 @@ _DIVIDER_PIXELS = 2
 
 @dataclass(frozen=True)
 class _Shape:
-    """Rings of a polygon (the outer one and its holes) or one line."""
+    """The rings of a polygon (the outer one and its holes), or one line."""
 
     rings: Sequence[Floats]
     """Each [V, 2], m."""
@@ -50,7 +50,7 @@ class VectorMap:
         self._cv2 = import_module("cv2")
 
     def raster(self, low: Floats, high: Floats) -> Raster:
-        """The map between two corners, at 3 pixels per metre.
+        """Return the map between two corners, at 3 pixels per metre.
 
         Args:
             low: [2], m; the raster's origin is the whole metre at or before it.
@@ -68,7 +68,7 @@ class VectorMap:
     def _fill(self, layer: Bytes, origin: Floats, far: Floats) -> None:
         for shape in _within(self._areas, origin, far):
             pixels = [np.round((ring - origin) * PIXELS_PER_METER) for ring in shape.rings]
-            # All rings in one call: holes stay as they were
+            # All rings in one call, so that holes are not filled
             self._cv2.fillPoly(layer, [_cv2_points(ring) for ring in pixels], 1)
 
     def _draw(self, layer: Bytes, dividers: Sequence[_Shape], origin: Floats, far: Floats) -> None:
@@ -78,7 +78,7 @@ class VectorMap:
 
 
 def _area(polygon: Any) -> _Shape:
-    """From a shapely polygon."""
+    """Return the shape of a shapely polygon."""
     return _shape([_vertices(polygon.exterior), *(_vertices(hole) for hole in polygon.interiors)])
 
 
@@ -96,10 +96,10 @@ def _shape(rings: Sequence[Floats]) -> _Shape:
 
 
 def _within(shapes: Sequence[_Shape], low: Floats, high: Floats) -> Iterator[_Shape]:
-    """Those whose bounding boxes meet the box."""
+    """Return the shapes whose bounding boxes intersect the box."""
     return (shape for shape in shapes if (shape.low <= high).all() and (shape.high >= low).all())
 
 
 def _cv2_points(pixels: Floats) -> NDArray[np.int32]:
-    """For cv2 the raster is an image whose lines run along x: (column, row), so (y, x)."""
+    """Return points in cv2's order, (column, row): the raster's lines run along x, so that is (y, x)."""
     return np.ascontiguousarray(pixels[:, ::-1]).astype(np.int32)

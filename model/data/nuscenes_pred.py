@@ -4,7 +4,7 @@
     map_0.1/<scene>.png              the raster, written by cv2 from [x, y, layer]
     map_0.1/meta_<scene>.txt         x and y of the raster's origin (m), pixels per metre
 
-It holds the vehicles of the challenge around their windows only: no pedestrians, parked cars or ego.
+It holds only the vehicles of the challenge, around their windows: no pedestrians, parked cars or ego vehicle.
 """
 
 import zlib
@@ -20,26 +20,27 @@ from model.data.scenes import DataError, Pair, SceneRecord, Track
 from model.scenes.scene import AgentType, Raster
 
 _FOLDERS = {"train": "train", "train_main": "train", "train_fold": "train", "train_val": "val"}
-"""The challenge's train_val is the folder val: AgentFormer evaluates on what the challenge validates on."""
+"""Folders of the splits. The challenge's train_val is the folder val: AgentFormer evaluates on the
+challenge's validation split."""
 _FOLD_PARTS = 10
-"""One scene of so many of train is in ``train_fold``, the others are in ``train_main``: recipes and epochs
-are chosen on the fold, so that figures on train_val are of data that chose nothing."""
+"""One in so many scenes of train is in ``train_fold``, the others are in ``train_main``. Recipes and epochs
+are chosen on the fold, so that train_val stays unseen."""
 _IN_FOLD = {"train_main": False, "train_fold": True}
 _CLASSES = frozenset({"Car", "Bus", "Truck", "Emergency", "Construction"})
 _COLUMNS = 18
-_FRAME, _AGENT, _CLASS, _X, _Y, _YAW, _ASKED = 0, 1, 2, 13, 15, 16, 17
+_FRAME, _AGENT, _CLASS, _X, _Y, _YAW, _IS_PAIR = 0, 1, 2, 13, 15, 16, 17
 _MAX_FRAMES = 10_000
-"""No scene is longer; a larger number is not a frame."""
+"""Maximum frame number; no scene is longer."""
 _MAX_PIXELS = 100_000_000
 
 
 class NuscenesPredReader:
-    """The real challenge without the data set itself: positions and headings as annotated."""
+    """The prediction challenge without the data set itself: positions and headings as annotated."""
 
     def __init__(self, folder: Path) -> None:
         """
         Args:
-            folder: holds ``label`` and ``map_0.1``.
+            folder: folder with ``label`` and ``map_0.1``.
         """
         self._folder = folder
 
@@ -50,14 +51,14 @@ class NuscenesPredReader:
 
     @property
     def splits(self) -> tuple[str, ...]:
-        """Splits of the prediction challenge, and train in two parts by scenes."""
+        """Splits of the prediction challenge, and train in two parts, by scenes."""
         return tuple(_FOLDERS)
 
     def scenes(self, split: str) -> Iterator[SceneRecord]:
-        """The scenes of a split that have pairs, in order of their names.
+        """Yield the scenes of a split that have pairs, in order of their names.
 
         Raises:
-            DataError: no such split, or a file is missing or bad; names it.
+            DataError: there is no such split, or a file is missing or bad; names it.
         """
         if split not in _FOLDERS:
             raise DataError(f"there is no split {split!r}; there are {', '.join(_FOLDERS)}")
@@ -81,7 +82,7 @@ class NuscenesPredReader:
 
 
 def _in_fold(scene: str) -> bool:
-    """Whether a scene of train is in the fold; it hangs on its name alone."""
+    """Return whether a scene of train is in the fold; it depends on its name alone."""
     return zlib.crc32(scene.encode()) % _FOLD_PARTS == 0
 
 
@@ -114,18 +115,18 @@ def _read_labels(file: Path) -> tuple[list[Track], list[Pair]]:
             raise DataError(f"{file}: agent {name} has frame {twice[0]} twice")
         position, heading = part[:, [_X, _Y]], part[:, _YAW].copy()
         tracks.append(Track(name, AgentType.VEHICLE, frames, position, heading))
-        pairs += [Pair(index, int(frame)) for frame in frames[part[:, _ASKED] == 1]]
+        pairs += [Pair(index, int(frame)) for frame in frames[part[:, _IS_PAIR] == 1]]
     pairs.sort(key=lambda pair: (pair.frame, pair.track))
     return tracks, pairs
 
 
 def _check_values(file: Path, numbers: Floats, values: Floats) -> None:
-    frame, agent, asked = values[:, _FRAME], values[:, _AGENT], values[:, _ASKED]
+    frame, agent, is_pair = values[:, _FRAME], values[:, _AGENT], values[:, _IS_PAIR]
     faults = {
         "a number that is not finite": ~np.isfinite(numbers).all(axis=1),
         "no proper frame number": (frame != np.floor(frame)) | (frame < 0) | (frame >= _MAX_FRAMES),
         "no proper agent id": agent != np.floor(agent),
-        "a last column that is neither 0 nor 1": (asked != 0) & (asked != 1),
+        "a last column that is neither 0 nor 1": (is_pair != 0) & (is_pair != 1),
     }
     for fault, rows in faults.items():
         bad = np.flatnonzero(rows)

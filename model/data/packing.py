@@ -1,7 +1,7 @@
-"""Rasters of many scenes in one flat array: a byte a pixel, a layer a bit.
+"""Packed rasters and map patches: one byte per pixel.
 
-Each raster has a border of one empty pixel all around, row by row. So a look-up that is clamped to one
-pixel outside finds zeros there without being told where the raster ends.
+Rasters of many scenes lie in one flat array, row by row, with one bit per layer. Each has a border of one
+empty pixel, so that a look-up clamped to one pixel outside finds zeros without testing for the raster's end.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ LAYERS = 3
 
 
 def pack(raster: Raster) -> Bytes:
-    """[(rows + 2) · (columns + 2)], flat, with the border."""
+    """Return a raster packed, flat, with its border: [(rows + 2) · (columns + 2)]."""
     bits = np.zeros(raster.layers.shape[1:], dtype=np.uint8)
     for layer in range(LAYERS):
         bits |= raster.layers[layer] << layer
@@ -24,22 +24,22 @@ def pack(raster: Raster) -> Bytes:
 
 
 def unpack(packed: Bytes, rows: int, columns: int) -> Bytes:
-    """[3, rows, columns], 0 or 1, of what ``pack`` made of a raster of that size."""
+    """Return the layers of a raster that ``pack`` packed: [3, rows, columns], 0 or 1."""
     bits = packed.reshape(rows + 2, columns + 2)[1:-1, 1:-1]
     return np.stack([bits >> layer & 1 for layer in range(LAYERS)])
 
 
 _LEVELS = 4
-"""Of a layer in a packed patch: 0, ⅓, ⅔, 1. Bilinear samples lie between 0 and 1 at edges only."""
+"""Levels of a layer in a packed patch: 0, ⅓, ⅔, 1. Bilinear samples are between 0 and 1 at edges only."""
 UNKNOWN = 1 << 6
-"""The byte of a pixel of which nothing is known."""
+"""Byte of an unknown pixel."""
 
 
 def pack_patches(patches: Float32s) -> Bytes:
-    """Return patches with a pixel's layers in one byte: [N, S, S].
+    """Return packed patches, with the layers of a pixel in one byte: [N, S, S].
 
     Args:
-        patches: [N, 3, S, S] in [0, 1]; ½ in all layers where nothing is known.
+        patches: [N, 3, S, S] in [0, 1]; ½ in all layers where unknown.
     """
     level = np.round(patches * (_LEVELS - 1)).astype(np.uint8)
     packed: Bytes = level[:, 0] | np.left_shift(level[:, 1], 2) | np.left_shift(level[:, 2], 4)
@@ -48,7 +48,7 @@ def pack_patches(patches: Float32s) -> Bytes:
 
 
 def _table() -> Tensor:
-    """Return the layers [256, 3] of each byte, in [-1, 1]; 0 where nothing is known."""
+    """Return the layers of each byte: [256, 3] in [-1, 1], 0 where unknown."""
     byte = torch.arange(256)
     layers = torch.stack([byte >> 2 * layer & 3 for layer in range(LAYERS)], dim=-1)
     table = 2 * layers.float() / (_LEVELS - 1) - 1
@@ -60,9 +60,9 @@ _TABLE = _table()
 
 
 def unpack_patches(packed: Tensor) -> Tensor:
-    """Return patches [N, 3, S, S] in [-1, 1], 0 unknown, of what ``pack_patches`` made (to ⅓ of a layer).
+    """Return patches that ``pack_patches`` packed: [N, 3, S, S] in [-1, 1], 0 unknown, rounded to its levels.
 
-    They are laid out channels last, which convolutions read quickest.
+    Their memory layout is channels last, which is fastest for convolutions.
 
     Args:
         packed: [N, S, S] uint8.

@@ -1,6 +1,6 @@
-"""Map patches of agents of many scenes at once, cut from packed rasters on any device.
+"""Map patches of agents in many scenes, cut from packed rasters on any device.
 
-The same patches as ``model.scenes.raster.cut_patches``; here all agents of a batch share one look-up.
+The patches equal those of ``model.scenes.raster.cut_patches``; here all agents of a batch share one look-up.
 """
 
 import numpy as np
@@ -13,27 +13,27 @@ from model.data.packing import LAYERS
 from model.scenes.raster import COLUMNS_RIGHT, PATCH_PIXELS_PER_METER, PATCH_SIZE, ROWS_BEHIND
 
 _CHUNK = {"cpu": 8}
-"""Agents at once: on a CPU what they need stays in its cache."""
+"""Agents at once, by type of device; so few fit into a CPU's cache."""
 _OTHER_CHUNK = 512
 _FAR = 1e4
-"""Pixels; an agent farther than that outside its raster sees as little as one that is just so far."""
+"""Pixels; agents farther outside their raster are treated as this far outside, as they see nothing of it."""
 
 
 class PatchCutter:
-    """Cuts the patches of a cache's pairs."""
+    """Cutter of the map patches of a cache's pairs."""
 
     def __init__(self, cache: Cache, device: torch.device) -> None:
         """
         Args:
-            cache: gives rasters and poses.
-            device: where patches are cut; the rasters are copied there unless it is the CPU.
+            cache: cache with rasters and poses.
+            device: device on which patches are cut; a GPU gets a copy of the rasters.
         """
         self._rasters = torch.from_numpy(cache.rasters).to(device)
         rows_columns = cache.raster_shape[cache.scene]
         scale = cache.raster_pixels_per_meter[cache.scene]
         center = (cache.position - cache.raster_origin[cache.scene]) * scale[:, None]
         center = np.clip(center, -_FAR, rows_columns + _FAR)
-        # Pixels are counted from the agent's own: small numbers, which float32 holds to 1e-5
+        # Pixels are relative to the agent's: small numbers, which float32 represents to 1e-5
         base = np.floor(center).astype(np.int64)
         stride = rows_columns[:, 1] + 2
         start = cache.raster_start[cache.scene] + (base[:, 0] + 1) * stride + base[:, 1] + 1
@@ -53,7 +53,7 @@ class PatchCutter:
         self._rows, self._columns = index - ROWS_BEHIND, index - COLUMNS_RIGHT
 
     def __call__(self, indices: Tensor) -> Tensor:
-        """Patches of pairs.
+        """Return the patches of pairs.
 
         Args:
             indices: [n] int64, on the device.
@@ -73,10 +73,10 @@ class PatchCutter:
         fraction, low, high = self._fraction[indices], self._low[indices], self._high[indices]
 
         def axis(k: int, along: Tensor, across: Tensor) -> tuple[Tensor, Tensor]:
-            """Raster pixel before each patch pixel, counted from the agent's, and the rest: [n, 100, 100]."""
+            """Return each patch pixel's place in the raster, relative to the agent: whole and fraction."""
             a = fraction[:, k, None] + self._rows * along
             place = a[:, :, None] + (self._columns * across)[:, None]
-            # The border of zeros is all there is outside
+            # Outside there is only the border of zeros
             place = torch.minimum(torch.maximum(place, low[:, k, None, None]), high[:, k, None, None])
             whole = torch.minimum(place.floor(), high[:, k, None, None] - 1)
             return whole, place.sub_(whole)
@@ -91,7 +91,7 @@ class PatchCutter:
             for corner in (index, index + 1, index + stride, index + (stride + 1))
         ]
         for layer in range(LAYERS):
-            # ∓1 for a layer's bit
+            # A layer's bit, as a number
             near, near_right, far, far_right = (
                 (corner & (1 << layer)).to(torch.float32) for corner in corners
             )

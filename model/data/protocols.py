@@ -1,12 +1,12 @@
-"""A frame of a recorded scene as forecasters see it, under either protocol of the inputs.
+"""Frames of a recorded scene as forecasters see them, under the two protocols of the inputs.
 
 Both go through ``model.scenes.resample``, as the server's requests do, so that training and serving share one
 derivation.
 
-- causal: positions and headings up to the present; the rest is derived from them, as for a client that
-  sends no derivatives.
-- paper: velocity, acceleration and heading rate by central differences over the *whole* track are given
-  beside them. These contain the next one to two positions: for comparison with published tables only.
+- causal: positions and headings up to the present are given. The rest is derived from them, as for a client
+  that sends no derivatives.
+- paper: velocity, acceleration and heading rate are given as well, by central differences over the *whole*
+  track. They contain the next one or two positions, and so are for comparison with published tables only.
 """
 
 from dataclasses import dataclass
@@ -22,17 +22,17 @@ from model.scenes.resample import resample
 from model.scenes.scene import STEP_SECONDS, AgentStates, Scene
 
 _OLDER_FRAMES = 4
-"""Frames before the history that its states can depend on: two of differences, and the one or two that a
-lost frame is interpolated from. What is older changes nothing."""
+"""Frames before the history on which its states can depend: two for differences, and one or two from which a
+lost frame is interpolated. Older frames change nothing."""
 
 
 def frame_scene(
     record: SceneRecord, frame: int, protocol: Protocol, history_frames: int
 ) -> tuple[Scene, Ints]:
-    """The scene at a frame. For many frames of one record, make ``SceneFrames`` once.
+    """Return the scene at a frame, as ``SceneFrames.at`` does; for many frames, use that.
 
     Returns:
-        The agents of that frame, and the index of each one's track [N], ascending: as ``SceneFrames.at``.
+        The agents of the frame, and the index of each one's track [N], ascending.
     """
     return SceneFrames(record, protocol, history_frames).at(frame)
 
@@ -44,7 +44,7 @@ class SceneFrames:
         """
         Args:
             record: the recorded scene.
-            protocol: how derivatives are made.
+            protocol: protocol of the inputs.
             history_frames: F, frames of history, now included.
         """
         self._record = record
@@ -53,11 +53,11 @@ class SceneFrames:
         self._derivatives = _central(self._table) if protocol is Protocol.PAPER else None
 
     def at(self, frame: int) -> tuple[Scene, Ints]:
-        """The scene at a frame: as ``frame_scene``.
+        """Return the scene at a frame, and the index of each agent's track [N], ascending.
 
-        Time is ``frame`` · 0.5 s. An agent that is not annotated at that frame is not there, as a client
-        sends none that it has lost; nor is one whose velocity is not known (a first sight, causal), as the
-        server refuses it.
+        Time is ``frame`` · 0.5 s. Agents that are not annotated at the frame are left out, as a client sends
+        none that it has lost. So are those of unknown velocity (first seen at the frame, causal protocol),
+        which the server refuses.
         """
         observations, seen = self._observed(frame)
         states = self._resampled(observations, frame)
@@ -67,7 +67,7 @@ class SceneFrames:
         return Scene(types, states.select(known), self._record.raster), seen
 
     def observations(self, frame: int) -> tuple[Observations, Ints]:
-        """What a client would send of the agents that ``at`` shows, and the index of each one's track [N]."""
+        """Return observations of the agents of ``at``, as a client sends them, and their tracks' indices."""
         observations, seen = self._observed(frame)
         known = self._resampled(observations, frame).velocity_known
         return observations.select(known), seen[known]
@@ -76,7 +76,7 @@ class SceneFrames:
         return resample(observations, frame * STEP_SECONDS, self._history_frames)
 
     def _observed(self, frame: int) -> tuple[Observations, Ints]:
-        """Observations of all that are annotated at a frame, and the index of each one's track [N]."""
+        """Return observations of all agents annotated at a frame, and their tracks' indices [N]."""
         table = self._table
         window = self._history_frames + _OLDER_FRAMES
         now = frame - table.first_frame
@@ -87,7 +87,7 @@ class SceneFrames:
             seen = np.flatnonzero(table.present[:, now])
         past = slice(now - window + 1, now + 1)
         present = table.present[seen, past]
-        # Observations are padded behind: the frames that are there go first, in order
+        # Observations are padded at the end: frames that are there come first, in order
         order = np.argsort(~present, axis=1, kind="stable")
         rows = np.arange(len(seen))[:, None]
         padding = ~present[rows, order]
@@ -115,10 +115,10 @@ class SceneFrames:
 
 @dataclass(frozen=True)
 class _Table:
-    """All tracks of a scene over all its frames, with empty frames in front."""
+    """All tracks of a scene over all its frames, preceded by empty frames."""
 
     first_frame: int
-    """Of the first column."""
+    """Frame of the first column."""
     present: Bools  # [N, L]
     position: Floats  # [N, L, 2], NaN where not present
     heading: Floats  # [N, L], NaN where not present
@@ -147,16 +147,18 @@ def _tabulate(record: SceneRecord, front: int) -> _Table:
 
 
 def _central(table: _Table) -> _Derivatives:
+    """Return derivatives by central differences over whole tracks."""
     velocity = _mean_of_differences(np.diff(table.position, axis=1), table.present)
     acceleration = _mean_of_differences(np.diff(velocity, axis=1), table.present)
-    turned = wrap_angle(np.diff(table.heading, axis=1))  # of frame to frame: the unwrapped heading's
+    turned = wrap_angle(np.diff(table.heading, axis=1))  # differences of the unwrapped heading
     return _Derivatives(velocity, acceleration, _mean_of_differences(turned, table.present))
 
 
 def _mean_of_differences(differences: Floats, present: Bools) -> Floats:
-    """Rate of change by central differences (``np.gradient`` of every unbroken run): the mean of the
-    differences to the frames before and after; the one there is at the ends of a run; zero in a run of
-    one frame; NaN where not present.
+    """Return rates of change by central differences (``np.gradient`` of every unbroken run).
+
+    A rate is the mean of the differences to the frames before and after; at the ends of a run, the only
+    difference; in a run of one frame, zero; NaN where not present.
 
     Args:
         differences: [N, L − 1, …], NaN where either frame is not present.

@@ -1,4 +1,4 @@
-"""A recorded scene, whatever data set it is from."""
+"""Recorded scenes, independent of the data set."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from model.scenes.scene import AgentType, Raster
 
 
 class DataError(Exception):
-    """Recorded data is missing or makes no sense; the text names the file."""
+    """A fault in recorded data, which is missing or inconsistent; the text names the file."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Track:
     """[F], rad."""
 
     def positions(self, frames: Ints) -> Floats:
-        """Where it was at any frames [...]: [..., 2], m, ground frame; NaN where it was not annotated."""
+        """Return positions at frames [...]: [..., 2], m, ground frame; NaN where not annotated."""
         row = np.minimum(np.searchsorted(self.frames, frames), len(self.frames) - 1)
         there = self.frames[row] == frames
         return np.where(there[..., None], self.position[row], np.nan)
@@ -38,12 +38,12 @@ class Track:
 
 @dataclass(frozen=True)
 class Pair:
-    """An agent and a frame that the prediction challenge asks for."""
+    """An agent and a frame to forecast from, as the prediction challenge lists them."""
 
     track: int
     """Index into the scene's tracks."""
     frame: int
-    """Number of the 2 Hz frame that is the present."""
+    """Number of the present 2 Hz frame."""
     token: str = ""
     """"instance_sample" as in the official lists; empty where the data has no tokens."""
 
@@ -55,36 +55,36 @@ class SceneRecord:
     name: str
     tracks: Sequence[Track]
     pairs: Sequence[Pair]
-    """Of the split that was read, ordered by frame, then by track."""
+    """Pairs of the split that was read, ordered by frame, then by track."""
     raster: Raster
 
     def stood(self, pairs: Sequence[Pair]) -> Bools:
         """Return which pairs' agents stood before now (``model.metrics.standing``): [N].
 
         Args:
-            pairs: N of this scene's.
+            pairs: N pairs of this scene.
         """
         back = np.arange(-STANDING_FRAMES, 1)
         return stood(np.stack([self.tracks[pair.track].positions(pair.frame + back) for pair in pairs]))
 
 
 class Reader(Interface):
-    """Gives the scenes of a data set."""
+    """A reader of the scenes of a data set."""
 
     @property
     def place(self) -> str:
-        """Where the data is: another place is other data."""
+        """Place of the data; it identifies the data in caches."""
         ...
 
     @property
     def splits(self) -> tuple[str, ...]:
-        """Names that ``scenes`` takes."""
+        """Names of the splits."""
         ...
 
     def scenes(self, split: str) -> Iterator[SceneRecord]:
-        """The scenes of a split that have pairs, in order of their names.
+        """Yield the scenes of a split that have pairs, in order of their names.
 
         Raises:
-            DataError: no such split, or a file is missing or bad; names it.
+            DataError: there is no such split, or a file is missing or bad; names it.
         """
         ...

@@ -1,12 +1,12 @@
-"""Recorded tracks as a tracker might have reported them: the inputs that training varies.
+"""Simulated tracker reports of recorded tracks, as inputs for training.
 
 Recorded scenes have clean poses at 2 Hz. A service gets observations at any rate, with noise, with and
-without headings and velocities, with gaps, of agents first seen a moment ago. Here such observations are
-drawn from recorded tracks, and brought onto the grid by ``model.scenes.resample``, as the server does.
+without headings and velocities, with gaps, of agents first seen a moment ago. Such observations are drawn
+here from recorded tracks and resampled onto the grid by ``model.scenes.resample``, as the server does.
 
 Between recorded poses an agent moves along a cubic Hermite spline. Its tangent now comes from the past alone
-(a parabola through the last three poses): a tangent from both sides would put the next position into the
-observations, as the papers' inputs have it.
+(a parabola through the last three poses): a tangent from both sides would leak the next position into the
+observations, as it does in the papers' inputs.
 """
 
 from dataclasses import dataclass, fields
@@ -30,12 +30,12 @@ MAX_HEADING_NOISE_RAD = 0.1
 MAX_VELOCITY_NOISE_MPS = 0.3
 MAX_JITTER_S = 0.03
 _SPAN_S = 3.5
-"""s of observations before the present, enough for the history and its derivatives."""
+"""s of observations up to the present, enough for the history and its derivatives."""
 
 
 @dataclass(frozen=True)
 class _Draw:
-    """How one scene is reported at one frame."""
+    """Parameters of the report of one scene at one frame."""
 
     rate_hz: float
     position_noise_m: float
@@ -46,8 +46,8 @@ class _Draw:
 
     @classmethod
     def of(cls, random: np.random.Generator) -> "_Draw":
-        def sometimes(share: float, most: float) -> float:
-            return most * random.random() if random.random() < share else 0.0
+        def sometimes(share: float, maximum: float) -> float:
+            return maximum * random.random() if random.random() < share else 0.0
 
         return cls(
             rate_hz=float(random.choice(RATES_HZ, p=_RATE_SHARES)),
@@ -60,12 +60,12 @@ class _Draw:
 
 
 class SensedFrames:
-    """The scenes at all frames of one record, as a tracker might have reported them.
+    """The frames of one recorded scene, as a tracker might have reported them.
 
     Args:
         record: the recorded scene.
         history_frames: F, frames of history, now included.
-        seed: of everything that is drawn.
+        seed: seed of all that is random.
     """
 
     def __init__(self, record: SceneRecord, history_frames: int, seed: int) -> None:
@@ -75,15 +75,14 @@ class SensedFrames:
         self._frames = SceneFrames(record, Protocol.CAUSAL, history_frames)
 
     def at(self, frame: int, variant: int) -> tuple[Scene, Ints]:
-        """Return one report of the scene at a frame: the agents that ``SceneFrames.at`` shows, and the index
-        of each one's track [N].
+        """Return one report of the scene at a frame, and the index of each agent's track [N].
 
-        Of an agent whose report tells no heading or no velocity (it stands and gives no heading; it was seen
-        once), the recorded states are taken.
+        The agents are those of ``SceneFrames.at``. An agent whose report has no heading or no velocity (it
+        stands and reports no heading, or it was seen once) gets its recorded states.
 
         Args:
-            frame: the present.
-            variant: another one is another report.
+            frame: the present frame.
+            variant: number of the report.
         """
         scene, tracks = self._frames.at(frame)
         if not len(tracks):
@@ -97,7 +96,7 @@ class SensedFrames:
         return Scene(scene.types, mixed, scene.raster), tracks
 
     def _observe(self, tracks: Ints, frame: int, draw: _Draw, random: np.random.Generator) -> Observations:
-        """Return the observations of some tracks, one at least, up to a frame."""
+        """Return the observations of some tracks, at least one, up to a frame."""
         count = int(_SPAN_S * draw.rate_hz) + 1
         rows = [self._observe_one(int(track), frame, count, draw, random) for track in tracks.tolist()]
         size = max(len(row.time) for row in rows)
@@ -122,6 +121,7 @@ class SensedFrames:
     def _observe_one(
         self, track: int, frame: int, count: int, draw: _Draw, random: np.random.Generator
     ) -> "_Report":
+        """Return the report of one track up to a frame, with ``count`` observations before losses."""
         one = self._record.tracks[track]
         now = int(np.searchsorted(one.frames, frame))
         start = now
@@ -145,7 +145,7 @@ class SensedFrames:
         position = position + draw.position_noise_m * random.standard_normal((size, 2))
         heading = heading + draw.heading_noise_rad * random.standard_normal(size)
         velocity = velocity + draw.velocity_noise_mps * random.standard_normal((size, 2))
-        if random.random() < 0.02:  # a detector now and then takes the front for the back
+        if random.random() < 0.02:  # detectors now and then confuse front and back
             heading[random.integers(size)] += np.pi
         if random.random() < 0.1:
             heading = np.full(size, np.nan)
@@ -163,14 +163,14 @@ class _Report:
 
 
 def _spline(positions: Floats, ages: Floats) -> tuple[Floats, Floats]:
-    """Return positions and velocities on the spline through poses 0.5 s apart, the last one now.
+    """Return positions and velocities on the spline through poses 0.5 s apart; the last one is now.
 
     Args:
         positions: [P, 2], m, oldest first.
         ages: [S], s before now, at most those of the oldest pose.
 
     Returns:
-        [S, 2] each, m and m/s; of a single pose the velocity is NaN.
+        [S, 2] each, m and m/s; for a single pose the velocity is NaN.
     """
     count = len(positions)
     if count == 1:
@@ -192,7 +192,7 @@ def _spline(positions: Floats, ages: Floats) -> tuple[Floats, Floats]:
 
 
 def _headings(headings: Floats, ages: Floats) -> Floats:
-    """Return headings between poses 0.5 s apart, along the shorter arc: [S], rad."""
+    """Return headings interpolated between poses 0.5 s apart, along the shorter arc: [S], rad."""
     turned = np.unwrap(headings)
     place = len(headings) - 1 - ages / STEP_SECONDS
     result: Floats = np.interp(place, np.arange(len(headings), dtype=np.float64), turned)
@@ -200,7 +200,7 @@ def _headings(headings: Floats, ages: Floats) -> Floats:
 
 
 def _where(chosen: Bools, some: AgentStates, others: AgentStates) -> AgentStates:
-    """Return states of each agent [N] from the first where it is chosen, else from the second."""
+    """Return each agent's states [N], from the first argument where it is chosen, else from the second."""
 
     def pick(one: Any, another: Any) -> Any:
         return np.where(chosen.reshape(-1, *[1] * (one.ndim - 1)), one, another)

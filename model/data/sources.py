@@ -1,4 +1,4 @@
-"""Data sets by the names that commands take."""
+"""Data sets by their names on the command line."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -23,14 +23,14 @@ READERS: dict[str, Callable[[Path], Reader]] = {
     "nuscenes": _official,
     "synthetic": SyntheticReader,
 }
-"""Readers of data sets by the KIND of KIND:PATH; the path of made-up data is its seed."""
+"""Readers of data sets by the KIND of KIND:PATH; the PATH of made-up data is its seed."""
 
 
 def parse_data(text: str) -> tuple[str, Path]:
-    """KIND and PATH of KIND:PATH.
+    """Return KIND and PATH of KIND:PATH.
 
     Raises:
-        DataError: it is no such thing, or the kind is unknown.
+        DataError: the text has another form, or the kind is unknown.
     """
     kind, colon, path = text.partition(":")
     if not colon or not path or kind not in READERS:
@@ -39,10 +39,10 @@ def parse_data(text: str) -> tuple[str, Path]:
 
 
 def parse_also(text: str) -> tuple[str, Path, str]:
-    """KIND, PATH and SPLIT of KIND:PATH@SPLIT; without one the split is ``train``.
+    """Return KIND, PATH and SPLIT of KIND:PATH@SPLIT; the default split is ``train``.
 
     Raises:
-        DataError: it is no such thing, or the kind is unknown.
+        DataError: the text has another form, or the kind is unknown.
     """
     place, at, split = text.rpartition("@")
     kind, path = parse_data(place if at else text)
@@ -50,10 +50,10 @@ def parse_also(text: str) -> tuple[str, Path, str]:
 
 
 def parse_protocol(name: str) -> Protocol:
-    """A protocol by its name.
+    """Return a protocol by its name.
 
     Raises:
-        DataError: there is none of that name.
+        DataError: there is no protocol of that name.
     """
     try:
         return Protocol(name)

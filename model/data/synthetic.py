@@ -1,86 +1,40 @@
-"""Made-up drives on rasters: what recorded data has too little of.
+"""Reader of made-up scenes, with what recorded data has too little of.
 
-Standing and parked cars, queues, reversing, bends of any radius, fast roads, vehicles that stand in a lane.
-Roads, drivers and traffic are drawn from wide ranges; nothing is taken from recorded data.
+That is standing and parked cars, queues, reversing, bends of any radius, fast roads, vehicles that stand in a
+lane. Roads, drivers and traffic are drawn from wide ranges; nothing is taken from recorded data.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from model.arrays import Bools, Floats
 from model.data.checks import FUTURE_STEPS, check_pairs
 from model.data.scenes import DataError, Pair, SceneRecord, Track
-from model.data.synthetic_roads import (
-    STEP,
-    Junction,
-    Lane,
-    Painter,
-    Road,
-    draw_junction,
-    draw_line,
-    draw_section,
-    headings,
-    places,
-    shifted,
-)
-from model.data.synthetic_traffic import TICK, Drives, Vehicle, clear, draw_driver, simulate, wander
+from model.data.synthetic_roads import Painter
+from model.data.synthetic_scenarios import KINDS, WARM_UP, Plan, draw_plan
+from model.data.synthetic_traffic import TICK, Drives, clear, simulate
 from model.geometry import rotate, wrap_angle
 from model.scenes.scene import STEP_SECONDS, AgentType
 
 SCENES = {"train": 1000, "validation": 60, "hard": 500}
-"""Scenes by split; those of ``hard`` are of the kinds in ``_HARD``."""
+"""Number of scenes by split."""
 VERSION = 1
-"""Of what is generated; whoever changes that raises it, so that caches of other scenes are stale."""
+"""Version of the generator. It must be raised with every change of the generated scenes, so that caches of
+other ones are rebuilt."""
 PAIRS = 10
-"""The most pairs of a scene."""
+"""Maximum number of pairs in a scene."""
 MARGIN = 77.0
-"""m of raster around all that ever is in a scene."""
+"""m of raster around all positions in a scene."""
 HISTORY_STEPS = 5
-"""Frames before the present that a pair has at least."""
+"""Minimum number of frames before the present of a pair."""
 
-_WARM_UP = 2.0
-"""s that traffic drives before the first frame."""
 _STANDING_STEPS = 4
 """Frames before the present in which a standing vehicle has not moved."""
-_OWN_STREAMS = 1000
-"""Numbers of streams from about here on are no lane's: their vehicles follow only each other."""
-_ROOM = 95.0
-"""m of road behind the last and before the first vehicle."""
-
-
-class Kind(NamedTuple):
-    """A kind of scene."""
-
-    share: float
-    lanes: tuple[float, float, float]
-    """Shares of 1, 2 and 3 lanes a direction."""
-    radii: tuple[float, float]
-    """m."""
-    turn: float
-    """rad, of the longest arc."""
-    desired: tuple[float, float]
-    """m/s."""
-    frames: int = 24
-    spread: float = 70.0
-    """m along a lane on which vehicles start."""
-
-
-_KINDS = {
-    "junction": Kind(0.3, (1, 0, 0), (1, 1), 0.0, (6.0, 16.0)),
-    "city": Kind(0.14, (0.6, 0.3, 0.1), (12.0, 500.0), 1.2, (5.0, 16.0)),
-    "bends": Kind(0.13, (0.9, 0.1, 0.0), (12.0, 120.0), 1.7, (7.0, 20.0)),
-    "fast": Kind(0.2, (0.1, 0.5, 0.4), (200.0, 5000.0), 0.6, (18.0, 40.0), 20, 160.0),
-    "lead": Kind(0.12, (0.5, 0.35, 0.15), (40.0, 800.0), 0.8, (5.0, 16.0)),
-    "queue": Kind(0.06, (0.5, 0.4, 0.1), (20.0, 500.0), 1.2, (0.3, 2.0)),
-    "parking": Kind(0.11, (0.9, 0.1, 0.0), (60.0, 800.0), 0.6, (4.0, 11.0)),
-}
 _HARD = {"junction": 0.3, "bends": 0.1, "lead": 0.4, "city": 0.2}
-"""Shares of the split ``hard``: standing leads, junctions, bends, sudden braking."""
-_WISHED = {
+"""Shares of kinds of scenes in the split ``hard``: standing leads, junctions, bends, sudden braking."""
+_PAIR_WEIGHTS = {
     "parked": 0.1,
     "standing": 0.15,
     "slow": 0.1,
@@ -90,60 +44,39 @@ _WISHED = {
     "curve": 0.38,
     "plain": 0.12,
 }
-"""Weights in the choice of pairs by what the vehicle does."""
-
-
-@dataclass
-class _Plan:
-    """A scene before it is driven."""
-
-    frames: int
-    roads: list[Road] = field(default_factory=list)
-    junction: Junction | None = None
-    stubs: list[tuple[Floats, float]] = field(default_factory=list)
-    """Lines [L, 2] and half widths, m, of side roads."""
-    vehicles: list[Vehicle] = field(default_factory=list)
-    parked: list[tuple[Floats, float]] = field(default_factory=list)
-    """Positions [2], m, and headings, rad."""
-    walkers: list[Floats] = field(default_factory=list)
-    """Ways [F, 2], m."""
-
-    @property
-    def seconds(self) -> float:
-        """How long the vehicles drive."""
-        return _WARM_UP + (self.frames - 1) * STEP_SECONDS
+"""Weights in the choice of pairs, by the behaviour of the vehicle."""
 
 
 class SyntheticReader:
-    """Made-up scenes; a seed stands for all of them, and each depends on seed, split and number alone."""
+    """Made-up scenes; each depends on seed, split and number alone."""
 
     def __init__(self, seed: Path) -> None:
         """
         Args:
-            seed: a whole number ≥ 0, in the shape of a path as other data sets have it.
+            seed: a whole number ≥ 0, as a path, as other readers take one.
 
         Raises:
-            DataError: it is no such number.
+            DataError: the seed is no such number.
         """
         if not (str(seed).isascii() and str(seed).isdecimal()):
-            raise DataError(f"synthetic:{seed}: not a seed, a whole number from 0 on")
+            raise DataError(f"synthetic:{seed}: the seed is not a whole number from 0 on")
         self._seed = int(str(seed))
 
     @property
     def place(self) -> str:
-        """The seed and the version of the generator, as other code makes other data."""
+        """The seed and the version of the generator."""
         return f"seed {self._seed}, version {VERSION}"
 
     @property
     def splits(self) -> tuple[str, ...]:
-        """Both are of one kind, and share no scene."""
+        """Names of the splits, which share no scene."""
         return tuple(SCENES)
 
     def scenes(self, split: str) -> Iterator[SceneRecord]:
         """Return the scenes of a split, in order of their names.
 
         Raises:
-            DataError: no such split.
+            DataError: there is no such split.
         """
         if split not in SCENES:
             raise DataError(f"there is no split {split!r}; there are {', '.join(SCENES)}")
@@ -154,22 +87,22 @@ class SyntheticReader:
 
         Args:
             split: one of the splits.
-            number: of the scene, from 0 on.
+            number: number of the scene, from 0 on.
         """
         rng = np.random.default_rng([self._seed, list(SCENES).index(split), number])
-        by_kind = {name: kind.share for name, kind in _KINDS.items()} if split != "hard" else _HARD
-        shares = np.array([by_kind.get(name, 0.0) for name in _KINDS])
-        name = str(rng.choice(list(_KINDS), p=shares / shares.sum()))
+        by_kind = {name: kind.share for name, kind in KINDS.items()} if split != "hard" else _HARD
+        shares = np.array([by_kind.get(name, 0.0) for name in KINDS])
+        name = str(rng.choice(list(KINDS), p=shares / shares.sum()))
         while True:
-            plan = _plan(rng, name)
+            plan = draw_plan(rng, name)
             if plan.vehicles:
                 return _record(rng, plan, f"{split}-{number:04}-{name}")
 
 
-def _record(rng: np.random.Generator, plan: _Plan, name: str) -> SceneRecord:
-    """The scene that comes of a plan."""
+def _record(rng: np.random.Generator, plan: Plan, name: str) -> SceneRecord:
+    """Return the scene that results from a plan."""
     drives = simulate(plan.vehicles, plan.seconds)
-    at = np.round((_WARM_UP + STEP_SECONDS * np.arange(plan.frames)) / TICK).astype(np.int64)
+    at = np.round((WARM_UP + STEP_SECONDS * np.arange(plan.frames)) / TICK).astype(np.int64)
     drives = Drives(drives.position[:, at], drives.heading[:, at], drives.speed[:, at])
     still = np.array([where for where, _ in plan.parked]).reshape(-1, 1, 2)
     towards = np.array([heading for _, heading in plan.parked]).reshape(-1, 1)
@@ -205,7 +138,7 @@ def _record(rng: np.random.Generator, plan: _Plan, name: str) -> SceneRecord:
 
 
 class _Placing:
-    """Puts a scene somewhere on a map: any direction, and traffic on the left in half of them."""
+    """Random placement of a scene on a map: any direction, and traffic on the left in half of them."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._mirror = np.array([1.0, rng.choice([-1.0, 1.0])])
@@ -213,16 +146,16 @@ class _Placing:
         self._origin = rng.uniform(950.0, 2300.0, 2)
 
     def points(self, points: Floats) -> Floats:
-        """[..., 2], m."""
+        """Return placed points [..., 2], m."""
         return rotate(points * self._mirror, self._turn) + self._origin
 
     def directions(self, heading: Floats) -> Floats:
-        """[...], rad."""
+        """Return placed directions [...], rad."""
         return wrap_angle(heading * self._mirror[1] + self._turn)
 
 
 def _course(walk: Floats) -> Floats:
-    """Direction [F] of a way [F, 2]; of one that stands, any."""
+    """Return the directions [F], rad, of a path [F, 2]; arbitrary where it stands."""
     ahead = np.gradient(walk, axis=0)
     return np.arctan2(ahead[:, 1], ahead[:, 0])
 
@@ -230,391 +163,28 @@ def _course(walk: Floats) -> Floats:
 def _pairs(
     rng: np.random.Generator, position: Floats, heading: Floats, speed: Floats, about_lead: Bools
 ) -> list[Pair]:
-    """Pairs drawn so that all that vehicles do is there in about the wished shares."""
+    """Draw pairs so that the vehicles' behaviours have about the shares of ``_PAIR_WEIGHTS``."""
     frames = np.arange(HISTORY_STEPS, position.shape[1] - FUTURE_STEPS)
-    kinds = list(_WISHED)
-    what = np.full((len(position), len(frames)), kinds.index("plain"))
+    kinds = list(_PAIR_WEIGHTS)
+    behavior = np.full((len(position), len(frames)), kinds.index("plain"))
     turned = np.unwrap(heading, axis=1)
     window = np.stack([turned[:, frames + k] for k in range(-2, FUTURE_STEPS + 1)])
-    what[np.ptp(window, axis=0) > 0.35] = kinds.index("curve")
-    what[about_lead] = kinds.index("lead")
+    behavior[np.ptp(window, axis=0) > 0.35] = kinds.index("curve")
+    behavior[about_lead] = kinds.index("lead")
     now = position[:, frames]
     ahead = np.stack([np.cos(heading[:, frames]), np.sin(heading[:, frames])], axis=-1)
     later = ((position[:, frames + FUTURE_STEPS] - now) * ahead).sum(axis=-1)
-    what[speed[:, frames] < 2.3] = kinds.index("slow")
-    what[(speed[:, frames] > 0) & (later < -0.5)] = kinds.index("reversing")
-    what[speed[:, frames] > 20] = kinds.index("fast")
+    behavior[speed[:, frames] < 2.3] = kinds.index("slow")
+    behavior[(speed[:, frames] > 0) & (later < -0.5)] = kinds.index("reversing")
+    behavior[speed[:, frames] > 20] = kinds.index("fast")
     stood = np.hypot(*(now - position[:, frames - _STANDING_STEPS]).T).T < 0.3
-    what[stood] = kinds.index("standing")
-    what[(speed == 0).all(axis=1)] = kinds.index("parked")
-    # Each kind gets its share of a scene, however many vehicles are of it
-    wished = np.array(list(_WISHED.values())) / np.maximum(np.bincount(what.ravel(), minlength=len(kinds)), 1)
-    keys = rng.exponential(1.0, what.shape) / wished[what]
+    behavior[stood] = kinds.index("standing")
+    behavior[(speed == 0).all(axis=1)] = kinds.index("parked")
+    # Each behaviour gets its share of a scene, however many vehicles show it
+    counts = np.bincount(behavior.ravel(), minlength=len(kinds))
+    weights = np.array(list(_PAIR_WEIGHTS.values())) / np.maximum(counts, 1)
+    keys = rng.exponential(1.0, behavior.shape) / weights[behavior]
     chosen = np.argsort(keys, axis=None)[:PAIRS]
-    rows, columns = np.unravel_index(chosen, what.shape)
+    rows, columns = np.unravel_index(chosen, behavior.shape)
     pairs = [Pair(int(row), int(frames[column])) for row, column in zip(rows, columns, strict=True)]
     return sorted(pairs, key=lambda pair: (pair.frame, pair.track))
-
-
-def _plan(rng: np.random.Generator, name: str) -> _Plan:
-    if name == "junction":
-        return _plan_junction(rng, _KINDS[name])
-    kind = _KINDS[name]
-    plan = _Plan(kind.frames)
-    desired = rng.uniform(*kind.desired)
-    road = _draw_road(rng, name, kind, desired, plan.seconds)
-    plan.roads.append(road)
-    length = len(road.line) * STEP
-    if name in ("city", "bends", "lead", "parking"):
-        plan.stubs += [_draw_stub(rng, road) for _ in range(rng.integers(0, 4))]
-    if name == "lead":
-        _add_lead(rng, plan, road, desired)
-    elif name == "parking":
-        for _ in range(rng.integers(1, 4)):
-            _add_reversing(rng, plan, road)
-    for stream, lane in enumerate(road.section.lanes):
-        taken = any(stream in (one.stream, one.joins) for one in plan.vehicles)
-        if taken or (plan.vehicles and rng.random() < 0.2):
-            continue
-        _add_traffic(rng, plan, road, stream, lane, kind, desired)
-    if name == "city" and rng.random() < 0.25:
-        _add_u_turn(rng, plan, road, desired)
-    reach = min(length - _ROOM, _ROOM + 120.0)
-    if name != "fast" or rng.random() < 0.15:
-        _add_parked(rng, plan, road, (_ROOM, reach), 10 if name in ("city", "parking") else 4)
-    if name not in ("fast", "bends") or rng.random() < 0.3:
-        _add_walkers(rng, plan, road, (_ROOM, reach), int(rng.integers(0, 5)))
-    return plan
-
-
-def _draw_road(rng: np.random.Generator, name: str, kind: Kind, desired: float, seconds: float) -> Road:
-    ahead = int(rng.choice([1, 2, 3], p=kind.lanes))
-    back = 0 if rng.random() < 0.3 else int(rng.integers(1, ahead + 1)) if rng.random() < 0.2 else ahead
-    width = rng.uniform(3.2, 3.9) if name == "fast" else rng.uniform(2.8, 3.9)
-    median = rng.uniform(0.0, 6.0) if rng.random() < (0.6 if name == "fast" else 0.12) else 0.0
-    strips = [0.0, 0.0]
-    for side in range(2):
-        if name == "fast":
-            strips[side] = rng.choice([0.0, rng.uniform(0.5, 3.0)])
-        elif name != "bends" and rng.random() < (0.9 if name == "parking" else 0.55):
-            strips[side] = rng.uniform(4.8, 5.6) if rng.random() < 0.25 else rng.uniform(1.8, 2.6)
-    section = draw_section(rng, ahead, back, width, median, (strips[0], strips[1]))
-    least = max(kind.radii[0], max(map(abs, section.edges)) + 6.0)
-    if name == "fast":
-        least = max(least, desired**2 / rng.uniform(1.5, 3.0))  # for little braking in its bends
-    length = 2 * _ROOM + kind.spread + max(desired, 3.0) * 1.15 * seconds
-    return Road(draw_line(rng, length, (least, max(kind.radii[1], 2 * least)), kind.turn), section)
-
-
-def _draw_stub(rng: np.random.Generator, road: Road) -> tuple[Floats, float]:
-    """A side road that no one of the scene takes."""
-    left = bool(rng.random() < 0.5)
-    row = int(rng.integers(len(road.line)))
-    d = road.section.edges[int(left)]
-    start = shifted(road.line, d - np.sign(d))[row]
-    away = headings(road.line)[row] + np.sign(d) * (np.pi / 2 + rng.uniform(-0.4, 0.4))
-    length = rng.choice([rng.uniform(6.0, 20.0), rng.uniform(30.0, 120.0)])
-    line = start + np.arange(0.0, length, STEP)[:, None] * np.array([np.cos(away), np.sin(away)])
-    return line, float(rng.uniform(1.8, 4.5))
-
-
-def _along(road: Road, lane: Lane, d: Floats | float) -> Floats:
-    """A way [L, 2] at d from the road's line as the lane runs, m."""
-    line = shifted(road.line, d)
-    return line if lane.ahead else line[::-1]
-
-
-def _step(place: Floats, begin: float, length: float) -> Floats:
-    """From 0 to 1, smoothly, over a length, m, from a place on."""
-    part = np.clip((place - begin) / length, 0.0, 1.0)
-    smooth_step: Floats = part * part * (3 - 2 * part)
-    return smooth_step
-
-
-def _add_traffic(
-    rng: np.random.Generator, plan: _Plan, road: Road, stream: int, lane: Lane, kind: Kind, desired: float
-) -> None:
-    """Vehicles in one lane, the first one first."""
-    start = _ROOM + rng.uniform(0.4, 1.0) * kind.spread
-    lanes = road.section.of(lane.ahead)
-    queue = desired < 3.0
-    halt = (0.0, rng.uniform(2.0, 40.0), 2.0) if queue and rng.random() < 0.25 else None
-    while start > _ROOM - 10 and len(plan.vehicles) < 9:
-        driver = draw_driver(rng, desired)
-        others = [one for one in lanes if abs(abs(one.d - lane.d) - road.section.lane_width) < 0.1]
-        changes = others and not queue and rng.random() < 0.2
-        most = min(0.45, road.section.lane_width / 2 - 1.1)
-        along = places(road.line)
-        d = np.full(len(along), lane.d)
-        begin = length = np.inf
-        joins = None
-        if changes:
-            onto = others[int(rng.integers(len(others)))]
-            length = max(driver.desired * rng.uniform(3.0, 6.0), 25.0)
-            begin = start + rng.uniform(0.0, 0.8) * driver.desired * plan.seconds
-            d += (onto.d - lane.d) * _step(along, begin, length)
-            joins = road.section.lanes.index(onto)
-        line, place = wander(rng, _along(road, lane, d if lane.ahead else d[::-1]), most, along)
-        vehicle = Vehicle(line, place, start, driver.desired, driver, stream)
-        vehicle.leaves, vehicle.joins, vehicle.joined = begin + length, joins, begin
-        _add_events(rng, vehicle, plan.seconds)
-        if halt:
-            vehicle.brakes, vehicle.speed = halt, 0.0
-            halt = (0.0, halt[1] + rng.uniform(0.5, 1.5), 2.0)
-        plan.vehicles.append(vehicle)
-        pause = rng.uniform(0.0, 3.0) if queue else driver.desired * rng.uniform(0.8, 4.0)
-        start -= 4.7 + driver.gap + pause
-
-
-def _add_events(rng: np.random.Generator, vehicle: Vehicle, seconds: float) -> None:
-    """Some change their speed, stop or start."""
-    event = rng.random()
-    when = rng.uniform(0.0, seconds - 2.0)
-    if vehicle.driver.desired > 18:
-        if event < 0.3:
-            vehicle.changes = (when, rng.uniform(0.7, 1.2))
-        elif event < 0.38:
-            vehicle.brakes = (when, when + rng.uniform(1.0, 3.0), rng.uniform(1.0, 3.0))
-    elif event < 0.12:
-        vehicle.brakes = (when, when + rng.uniform(5.0, 60.0), rng.uniform(1.0, 4.0))
-    elif event < 0.24:
-        vehicle.speed, vehicle.brakes = 0.0, (0.0, rng.uniform(1.0, 2.5 * seconds), 2.0)
-    elif event < 0.5:
-        vehicle.changes = (when, rng.uniform(0.3, 1.8))
-
-
-def _add_lead(rng: np.random.Generator, plan: _Plan, road: Road, desired: float) -> None:
-    """A vehicle that stands in a lane, and some that come from behind: they stop or go round it."""
-    section = road.section
-    lanes = section.of(ahead=True)
-    index = len(lanes) - 1 if rng.random() < 0.8 else int(rng.integers(len(lanes)))
-    lane = lanes[index]
-    driver = draw_driver(rng, desired)
-    where = _ROOM + rng.uniform(0.5, 1.0) * _KINDS["lead"].spread + rng.uniform(0.0, 2.0) * desired
-    line, place = wander(rng, _along(road, lane, lane.d), 0.6, places(road.line))
-    plan.vehicles.append(
-        Vehicle(line, place, where, 0.0, driver, index, brakes=(0.0, np.inf, 2.0), about_lead=True)
-    )
-    # To the left is the lane beside, or the other direction's
-    left = [one.d - lane.d for one in section.lanes if 0 < one.d - lane.d < section.lane_width + 1.5]
-    right = [one.d - lane.d for one in lanes if -section.lane_width - 0.1 < one.d - lane.d < 0]
-    sides = (left or right) if section.median is None or index else right
-    passes = bool(sides) and rng.random() < 0.55
-    start = where - max(9.0, desired * rng.uniform(1.5, 7.0))
-    for _ in range(rng.integers(1, 4)):
-        if start < _ROOM - 40:
-            break
-        driver = draw_driver(rng, desired)
-        along = places(road.line)
-        d = np.full(len(along), lane.d)
-        if passes:
-            aside = sides[0] * rng.uniform(min(0.95, 2.5 / abs(sides[0])), 1.05)
-            leaving, returning = (max(driver.desired * rng.uniform(1.3, 3.0), 11.0) for _ in range(2))
-            d += aside * _step(along, where - 5.5 - leaving, leaving)
-            if len(lanes) == 1 or rng.random() < 0.5:
-                d -= aside * _step(along, where + rng.uniform(5.5, 12.0), returning)
-        line, place = wander(rng, _along(road, lane, d), 0.25, along)
-        stream = _OWN_STREAMS - 1 if passes else index
-        vehicle = Vehicle(line, place, start, driver.desired, driver, stream, about_lead=True)
-        if passes and sides[0] > 0 and len(lanes) == 1:
-            vehicle.joins = index + 1  # no one may come towards it
-        plan.vehicles.append(vehicle)
-        start -= 4.7 + driver.gap + driver.desired * rng.uniform(0.7, 2.5)
-
-
-def _add_reversing(rng: np.random.Generator, plan: _Plan, road: Road) -> None:
-    """A vehicle that moves backwards: into a strip, out of a place across, or along the kerb."""
-    section = road.section
-    row = int(rng.uniform(_ROOM + 10, _ROOM + 70) / STEP)
-    strip = section.strips[int(rng.integers(len(section.strips)))] if section.strips else None
-    ahead = strip.d < 0 if strip else True
-    if strip and strip.d > 0 and not section.of(ahead=False):
-        ahead = True
-    lanes = section.of(ahead)
-    lane = lanes[0] if strip and (strip.d > 0) is ahead else lanes[-1]
-    way = road.line if ahead else road.line[::-1]
-    sign = 1.0 if ahead else -1.0
-    backwards = way[row : row - int(60 / STEP) : -1]
-    place = places(backwards)
-    # What lies to the left of the traffic lies to the right of who reverses
-    across = strip.d if strip else lane.d
-    d = np.full(len(place), sign * lane.d)
-    length = rng.uniform(4.0, 25.0)
-    if strip and strip.across:
-        radius = rng.uniform(5.0, 7.5)
-        corner = shifted(backwards, -sign * lane.d)
-        out = shifted(backwards, -sign * across)
-        bay = out[0] + np.linspace(0, 1, 12)[:, None] * (corner[0] - out[0])
-        straight = corner[int(radius / STEP) :]
-        room = max(float(np.hypot(*(out[0] - corner[0]))) - radius, 0.2)
-        begin = bay[0] + (bay[-1] - bay[0]) / np.hypot(*(bay[-1] - bay[0])) * room
-        angle = np.linspace(0.0, np.pi / 2, 16)[:, None]
-        arc = begin + (corner[0] - begin) * np.sin(angle) + (straight[0] - corner[0]) * (1 - np.cos(angle))
-        line = np.concatenate([bay[:1], arc, straight[1:]])
-        length += float(np.hypot(*(arc[-1] - bay[0])))
-    else:
-        if strip and rng.random() < 0.6:
-            side = rng.uniform(8.0, 12.0)
-            length = max(length, side + 2.0)
-            d += sign * (across - lane.d) * _step(place, rng.uniform(0.0, length - side), side)
-        elif strip and rng.random() < 0.4:
-            d[:] = sign * across
-        line = shifted(backwards, -d)
-    line, place = wander(rng, line, 0.15, places(line))
-    line, place = line[: int(length / STEP)], place[: int(length / STEP)]
-    driver = draw_driver(rng, rng.uniform(1.0, 3.0))
-    driver = replace(driver, acceleration=rng.uniform(0.4, 1.2), braking=rng.uniform(0.5, 1.5))
-    vehicle = Vehicle(line, place, 0.0, 0.0, driver, _OWN_STREAMS + len(plan.vehicles))
-    vehicle.brakes = (0.0, rng.uniform(0.0, 5.0), 2.0)  # few are asked for before
-    vehicle.backwards = vehicle.ends = True
-    plan.vehicles.append(vehicle)
-
-
-def _add_u_turn(rng: np.random.Generator, plan: _Plan, road: Road, desired: float) -> None:
-    """A vehicle that turns back, where the road is wide enough."""
-    section = road.section
-    ways = [
-        (lane, back)
-        for lane in section.of(ahead=True)
-        for back in section.of(ahead=False)
-        if back.d - lane.d > 9.6 and section.median is None
-    ]
-    if not ways:
-        return
-    lane, back = ways[int(rng.integers(len(ways)))]
-    row = int((_ROOM + rng.uniform(40.0, 70.0)) / STEP)
-    radius = (back.d - lane.d) / 2
-    heading = headings(road.line)[row]
-    ahead, side = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
-    angle = np.linspace(0.0, np.pi, 30)[1:-1, None]
-    round_ = road.line[row] + side * (lane.d + radius * (1 - np.cos(angle))) + ahead * radius * np.sin(angle)
-    line = np.concatenate(
-        [shifted(road.line, lane.d)[: row + 1], round_, shifted(road.line, back.d)[row::-1]]
-    )
-    line, place = wander(rng, line, 0.3, places(line))
-    start = row * STEP - rng.uniform(5.0, 40.0)
-    driver = draw_driver(rng, min(desired, 9.0))
-    plan.vehicles.insert(0, Vehicle(line, place, start, driver.desired, driver, _OWN_STREAMS - 1))
-
-
-def _add_parked(
-    rng: np.random.Generator, plan: _Plan, road: Road, between: tuple[float, float], most: int
-) -> None:
-    """Cars in the strips."""
-    line = road.line
-    direction = headings(line)
-    for strip in road.section.strips:
-        taken = rng.uniform(0.0, 0.95)
-        middle = shifted(line, strip.d)
-        at = between[0] + rng.uniform(0.0, 8.0)
-        parked = 0
-        while at < between[1] and parked < most:
-            if rng.random() < taken:
-                row = min(int(at / STEP), len(line) - 1)
-                heading = direction[row] + (np.pi if (strip.d > 0) != (rng.random() < 0.1) else 0.0)
-                if strip.across:
-                    heading += rng.choice([-0.5, 0.5]) * np.pi
-                plan.parked.append((middle[row] + rng.normal(0.0, 0.12, 2), heading + rng.normal(0.0, 0.03)))
-                parked += 1
-            at += rng.uniform(2.6, 3.2) if strip.across else rng.uniform(5.6, 7.5)
-
-
-def _add_walkers(
-    rng: np.random.Generator, plan: _Plan, road: Road, between: tuple[float, float], number: int
-) -> None:
-    """Pedestrians beside the road, of whom some stand."""
-    for _ in range(number):
-        d = road.section.edges[0] - rng.uniform(0.8, 3.5) if rng.random() < 0.5 else 0.0
-        d = d or road.section.edges[1] + rng.uniform(0.8, 3.5)
-        pace = 0.0 if rng.random() < 0.25 else rng.normal(1.35, 0.25) * rng.choice([-1.0, 1.0])
-        at = rng.uniform(*between) + pace * STEP_SECONDS * np.arange(plan.frames)
-        rows = places(road.line)
-        way = shifted(road.line, d)
-        plan.walkers.append(np.stack([np.interp(at, rows, axis) for axis in way.T], axis=-1))
-
-
-def _plan_junction(rng: np.random.Generator, kind: Kind) -> _Plan:
-    plan = _Plan(kind.frames)
-    desired = rng.uniform(*kind.desired)
-    reach = 2 * _ROOM + desired * 1.15 * plan.seconds
-    junction = draw_junction(rng, reach)
-    plan.junction = junction
-    control = "free" if junction.ring else str(rng.choice(["lights", "signs", "free"], p=[0.7, 0.08, 0.22]))
-    green = int(rng.integers(2))
-    change = rng.uniform(1.0, 1.4 * plan.seconds) if rng.random() < 0.4 else np.inf
-    for arm in rng.permutation(len(junction.arms)).tolist():
-        section = junction.arms[arm].section
-        for index in range(len(section.of(ahead=False))):
-            if rng.random() < 0.2:
-                continue
-            held = control == "signs" or (control == "lights" and arm % 2 != green)
-            until = change if control == "lights" else np.inf
-            _add_arm(rng, plan, junction, (arm, index), desired, held, until, control == "signs")
-        road = junction.arms[arm]
-        near = road.begin + 12.0
-        _add_parked(rng, plan, road, (near, near + 40.0), 3)
-        _add_walkers(rng, plan, road, (road.begin + 3.0, near + 25.0), int(rng.integers(0, 3)))
-    return plan
-
-
-def _add_arm(
-    rng: np.random.Generator,
-    plan: _Plan,
-    junction: Junction,
-    whence: tuple[int, int],
-    desired: float,
-    held: bool,
-    until: float,
-    signs: bool,
-) -> None:
-    """Vehicles that come in by one lane (arm, number) of a junction, or have come."""
-    arm, index = whence
-    entry = junction.arms[arm].lane(junction.arms[arm].section.of(ahead=False)[index])
-    waits = held and rng.random() < 0.65
-    before = rng.uniform(2.8, 5.0) if waits else rng.uniform(-12.0, 0.8 * desired * plan.seconds)
-    for _ in range(rng.integers(1, 4)):
-        driver = draw_driver(rng, desired)
-        exit_arm, lane = _draw_exit(rng, junction, arm, index)
-        exit_ = junction.arms[exit_arm].lane(junction.arms[exit_arm].section.of(ahead=True)[lane])
-        across = junction.connect(entry, exit_, (arm, exit_arm))
-        raw = np.concatenate([entry, across[1:-1], exit_])
-        length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(raw, axis=0).T))])
-        stop, out = length[len(entry) - 1], length[len(entry) + len(across) - 3]
-        line, place = wander(rng, raw, 0.4, length)
-        own = places(line)
-        at = float(np.interp(stop, place, own))
-        start = at - before
-        vehicle = Vehicle(line, place - stop, start, driver.desired, driver, arm * 10 + index)
-        vehicle.leaves = float(np.interp(out, place, own))
-        vehicle.joins, vehicle.joined, vehicle.shift = 100 + exit_arm * 10 + lane, at, stop - out
-        if held and start + 2.4 < at:
-            vehicle.stop, vehicle.until = at - rng.uniform(0.0, 1.5), until
-            if signs:
-                vehicle.wait = rng.uniform(0.3, 3.0)
-        elif not held or start > at:
-            _add_events(rng, vehicle, plan.seconds)
-        if waits:
-            vehicle.speed = 0.0
-        plan.vehicles.append(vehicle)
-        pause = rng.uniform(0.0, 1.5) if waits else driver.desired * rng.uniform(0.7, 3.0)
-        before += 4.7 + driver.gap + pause
-
-
-def _draw_exit(rng: np.random.Generator, junction: Junction, arm: int, index: int) -> tuple[int, int]:
-    """The arm and the lane by which one leaves: left from the innermost lane, right from the outermost."""
-    inward = headings(junction.arms[arm].line[:3])[0] + np.pi
-    last = len(junction.arms[arm].section.of(ahead=False)) - 1
-    choices: list[tuple[int, int]] = []
-    weights = []
-    for other, road in enumerate(junction.arms):
-        if other == arm:
-            continue
-        turn = float(wrap_angle(headings(road.line[:3])[:1] - inward)[0])
-        lanes = len(road.section.of(ahead=True))
-        straight = abs(turn) < 0.6
-        fits = straight or bool(junction.ring) or index == (0 if turn > 0 else last)
-        lane = min(index, lanes - 1) if straight else 0 if turn > 0 else lanes - 1
-        choices.append((other, lane))
-        weights.append((0.45 if straight else 0.3) if fits else 1e-6)
-    chosen = int(rng.choice(len(choices), p=np.array(weights) / sum(weights)))
-    return choices[chosen]

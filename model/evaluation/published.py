@@ -7,7 +7,7 @@ names of the models, and tell their figures by ours of the metrics.
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from model.metrics.convergence import RANGES_M
+from model.metrics.consistency import RANGES_M
 from model.metrics.hard import HARD_SHARES
 
 Horizons = tuple[float, float, float, float, float, float]

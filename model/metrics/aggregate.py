@@ -1,34 +1,34 @@
-"""Means over many batches without keeping them."""
+"""Means of metrics over many batches, without keeping the batches."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any, Final
+from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 
 from model.arrays import Floats
 
 INFINITE: Final = 1e300
-"""Values beyond it count as infinite: sums of what is below cannot overflow."""
+"""Values beyond it count as infinite, so that sums cannot overflow."""
 COUNTED: Final = ("merged_modes_90", "moving_merged_modes_90")
-"""Metrics that are small whole numbers: how often each occurs is kept, for their medians."""
+"""Metrics that are small whole numbers; the number of each value is kept, for their medians."""
 
 
 @dataclass
 class _Sum:
-    """An exact sum: floats that add up to it without rounding, so that no order of addition matters."""
+    """An exact sum, as floats that add up to it without rounding; so the order of addition is irrelevant."""
 
     parts: list[float] = field(default_factory=list)
     count: int = 0
     missing: int = 0
-    """NaN."""
+    """Number of NaN."""
     above: int = 0
-    """Infinite."""
+    """Number of infinite values."""
     below: int = 0
-    """Negative infinite."""
+    """Number of negative infinite values."""
     occurrences: list[list[float]] = field(default_factory=list)
-    """Of a metric that is counted: each value and how often it came, ascending; of others nothing."""
+    """For a counted metric, each value with its number of occurrences, ascending; else empty."""
 
     def add_values(self, values: Floats) -> None:
         known = values[~np.isnan(values)]
@@ -53,7 +53,7 @@ class _Sum:
         self.below += other.below
 
     def add_parts(self, values: list[float]) -> None:
-        """fsum rounds once; what it rounded off is the sum of all less what it gave."""
+        """Add values; ``fsum`` rounds once, and its error is the sum of all terms minus its result."""
         terms = [*self.parts, *values]
         self.parts = []
         while (part := math.fsum([*terms, *(-p for p in self.parts)])) != 0:
@@ -75,18 +75,17 @@ class _Sum:
 
 
 class MetricMeans:
-    """Adds batches of per-instance metrics, and gives each one's mean and count.
+    """Mean and count of each metric over batches of instances.
 
-    Sums are exact: the means are to the last bit the same for the same instances, however they were cut into
-    batches, in whatever order they came, and through whatever sequence of ``merge`` or ``state``. NaN is
-    counted apart; infinite values make the mean infinite.
+    Sums are exact: for the same instances the means are the same to the last bit, whatever the batches and
+    their order, merged or not. NaN are counted separately; infinite values make the mean infinite.
     """
 
     def __init__(self) -> None:
         self._sums: dict[str, _Sum] = {}
 
     def add(self, batch: Mapping[str, Floats]) -> None:
-        """Adds instances.
+        """Add instances.
 
         Args:
             batch: [n] (or any shape, all elements alike) by metric. Batches need not have the same metrics.
@@ -100,16 +99,16 @@ class MetricMeans:
                 total.add_occurrences(zip(found.tolist(), times.tolist(), strict=True))
 
     def merge(self, other: "MetricMeans") -> None:
-        """Adds all that another one holds."""
+        """Add the content of another instance."""
         for name, theirs in other._sums.items():
             self._sums.setdefault(name, _Sum()).add_sum(theirs)
 
     def names(self) -> list[str]:
-        """Metrics seen so far, in order of first sight."""
+        """Return the metrics seen so far, in order of first appearance."""
         return list(self._sums)
 
     def mean(self, name: str) -> float:
-        """Mean of a metric over the instances that have it; NaN if none has.
+        """Return the mean of a metric over the instances that have it; NaN if none has.
 
         Raises:
             KeyError: no batch had that metric.
@@ -117,49 +116,21 @@ class MetricMeans:
         return self._sums[name].mean()
 
     def count(self, name: str) -> int:
-        """How many instances have the metric (are not NaN)."""
+        """Return the number of instances that have the metric (are not NaN)."""
         return self._sums[name].count
 
     def missing(self, name: str) -> int:
-        """How many instances came with NaN."""
+        """Return the number of instances with NaN."""
         return self._sums[name].missing
 
     def means(self) -> dict[str, float]:
-        """Mean of each metric, by name."""
+        """Return the mean of each metric, by name."""
         return {name: total.mean() for name, total in self._sums.items()}
 
     def medians(self) -> dict[str, float]:
-        """Median of each of the metrics that are counted, as ``<metric>_median``; NaN if none has it."""
+        """Return the medians of the counted metrics, as ``<metric>_median``; NaN if no instance has it."""
         return {f"{name}_median": self._sums[name].median() for name in COUNTED if name in self._sums}
 
     def figures(self) -> dict[str, float]:
-        """Means, and the medians that there are, by name."""
+        """Return means, and medians of counted metrics, by name."""
         return self.means() | self.medians()
-
-    def state(self) -> dict[str, dict[str, Any]]:
-        """All that is known, as JSON can hold it without loss (Python's floats come back as they were)."""
-        return {name: asdict(total) for name, total in self._sums.items()}
-
-    @classmethod
-    def from_state(cls, state: Mapping[str, Mapping[str, Any]]) -> "MetricMeans":
-        """The one that gave this ``state``.
-
-        Raises:
-            ValueError: it is not of that form.
-        """
-        means = cls()
-        for name, saved in state.items():
-            match saved:
-                case {
-                    "parts": list(parts),
-                    "count": int(count),
-                    "missing": int(missing),
-                    "above": int(above),
-                    "below": int(below),
-                    "occurrences": list(occurrences),
-                }:
-                    total = means._sums[name] = _Sum([float(p) for p in parts], count, missing, above, below)
-                    total.add_occurrences(occurrences)
-                case _:
-                    raise ValueError(f"no saved sum: {name}")
-        return means

@@ -1,12 +1,12 @@
-"""How probable the truth was: negative log-likelihood, and calibration of the stated uncertainty.
+"""Probability of the truth: negative log-likelihood, and calibration of the stated uncertainty.
 
 The density is that of ``TrajectoryMixture``. A mode of a unicycle that drives straight is certain of its
-lateral position (Trajectron++ lets no heading uncertainty grow below 0.01 rad/s), and one that stands
-nearly of all: *measured* with the published Trajectron++ weights, every tenth Gaussian is singular in float32
-at 0.5 s, and some are at every step. Their likelihood tells rounding from rounding, not good from bad. So
-the mixture may be ``widened`` first by the error of the labels: the likelihood then is that of the labelled
-position. The published network code bounds the same thing otherwise (1 − ρ² at least 1e-5, log-likelihood at
-most 6), in a way that depends on the axes.
+lateral position (in Trajectron++ no heading uncertainty grows below 0.01 rad/s), and one that stands is
+nearly certain of all: *measured* with the published Trajectron++ weights, every tenth Gaussian is singular
+in float32 at 0.5 s, and some are at every step. Their likelihoods differ by rounding, not by quality. So the
+mixture may first be ``widened`` by the error of the labels; the likelihood is then that of the labelled
+position. The published network code has other bounds for the same purpose (1 − ρ² at least 1e-5,
+log-likelihood at most 6), which depend on the axes.
 """
 
 from collections.abc import Sequence
@@ -21,24 +21,24 @@ LABEL_NOISE_M = 0.1
 """Standard deviation of labelled positions along each axis, m, rounded up: the Kalman filter's measurement
 noise fitted to the same labels is 0.08 m."""
 LEVELS = (0.5, 0.9, 0.99)
-"""Probabilities of the regions that calibration looks at."""
+"""Probabilities of the regions for calibration."""
 DRAWS = 199
-"""Positions drawn to find a density's rank. One more than that times each level is a whole number: the
-estimated share inside is unbiased then, however few they are."""
+"""Positions drawn to estimate a density's rank. (DRAWS + 1) times each level is a whole number, which makes
+the estimated share inside unbiased, however few draws there are."""
 
 _CHUNK_ELEMENTS = 1 << 19
-"""Gaussian densities computed at once: 4 MB an array."""
+"""Gaussian densities computed at once; 4 MB an array."""
 
 
 def widened(mixture: TrajectoryMixture, noise_m: float) -> TrajectoryMixture:
-    """The mixture of positions as labelled: each Gaussian convolved with the labels' error.
+    """Return the mixture of labelled positions: each Gaussian convolved with the labels' error.
 
     Args:
-        mixture: of any device and precision.
-        noise_m: the error's standard deviation along each axis, m; 0 changes nothing but the precision.
+        mixture: forecasts on any device, of any precision.
+        noise_m: the error's standard deviation along each axis, m; 0 changes only the precision.
 
     Returns:
-        float64, on the CPU.
+        The mixture in float64, on the CPU.
 
     Raises:
         ValueError: the noise is negative.
@@ -55,17 +55,17 @@ def widened(mixture: TrajectoryMixture, noise_m: float) -> TrajectoryMixture:
 
 
 def nll(mixture: TrajectoryMixture, truth: Floats, noise_m: float = 0.0) -> Floats:
-    """Negative log-likelihood of the true position at each step, under the whole mixture.
+    """Return the negative log-likelihood of the true position at each step, under the whole mixture.
 
     Args:
-        mixture: N, T.
+        mixture: N forecasts of T steps.
         truth: [N, T, 2], m, ground frame.
-        noise_m: of ``widened``, m.
+        noise_m: noise of ``widened``, m.
 
     Returns:
-        [N, T], nats, of a density in 1/m²; NaN where the truth is not finite, and where a mode is singular
-        (without noise, or where it is so wide that its covariance's rounding is more than the noise): there
-        is no density then.
+        [N, T], nats, of a density in 1/m²; NaN where the truth is not finite, and where a mode is singular,
+        so that there is no density (without noise, or where the rounding of a wide covariance exceeds the
+        noise).
     """
     wide = widened(mixture, noise_m)
     steps = -wide.log_density(torch.from_numpy(_finite(truth)))
@@ -73,7 +73,7 @@ def nll(mixture: TrajectoryMixture, truth: Floats, noise_m: float = 0.0) -> Floa
 
 
 def joint_nll(mixture: TrajectoryMixture, truth: Floats, noise_m: float = 0.0) -> Floats:
-    """Negative log-likelihood of the whole true trajectory.
+    """Return the negative log-likelihood of the whole true trajectory.
 
     Given the mode, the steps' densities multiply: −log Σ_k w_k Π_t N_kt(y_t).
 
@@ -93,17 +93,17 @@ def density_rank(
     noise_m: float = 0.0,
     draws: int = DRAWS,
 ) -> Floats:
-    """The probability of the region, at each step, in which the density is higher than at the truth.
+    """Return the probability of the region in which the density is higher than at the truth, at each step.
 
-    The truth is inside the highest-density region of probability p where this is below p; for a calibrated
+    The truth is inside the highest-density region of probability p where this is below p. For a calibrated
     forecast it is uniform on (0, 1). With one mode the region is an ellipse: 1 − exp(−m²/2) for a
     Mahalanobis distance m. With more, positions are drawn: (those denser than the truth + ½) / (draws + 1).
 
     Args:
-        mixture: N, T.
+        mixture: N forecasts of T steps.
         truth: [N, T, 2], m, ground frame.
-        seeds: N, one an instance (see ``TrajectoryMixture.sample``); unused with one mode.
-        noise_m: of ``widened``, m.
+        seeds: N seeds, one per instance (see ``TrajectoryMixture.sample``); unused with one mode.
+        noise_m: noise of ``widened``, m.
         draws: positions drawn at each step.
 
     Returns:
@@ -124,11 +124,13 @@ def density_rank(
 
 
 def inside_region(rank: Floats, level: float) -> Floats:
-    """Whether the truth was inside the highest-density region; the mean over instances is to equal the level.
+    """Return whether the truth was inside the highest-density region of a probability.
+
+    The mean over instances equals that probability if the forecasts are calibrated.
 
     Args:
-        rank: [...], of ``density_rank``.
-        level: the region's probability.
+        rank: [...], from ``density_rank``.
+        level: probability of the region.
 
     Returns:
         [...], 1 or 0; NaN where the rank is.
@@ -137,13 +139,13 @@ def inside_region(rank: Floats, level: float) -> Floats:
 
 
 def _singular(mixture: TrajectoryMixture) -> torch.Tensor:
-    """Where a mode's covariance has no inverse: [N, T]."""
+    """Return where a mode's covariance has no inverse: [N, T]."""
     c = mixture.covariances
     return (c[..., 0, 0] * c[..., 1, 1] <= c[..., 0, 1].square()).any(dim=1)
 
 
 def _finite(truth: Floats) -> Floats:
-    """Infinities become NaN, and a view becomes an array that torch takes."""
+    """Return the truth with infinities as NaN, as a contiguous array, which torch needs."""
     return np.ascontiguousarray(np.where(np.isfinite(truth), truth, np.nan))
 
 

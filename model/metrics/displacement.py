@@ -1,4 +1,4 @@
-"""Distance between forecast and truth: ADE and FDE by horizon, of one trajectory or expected over many.
+"""Distances between forecast and truth: ADE and FDE by horizon, for one trajectory or expected over many.
 
 ADE: mean distance over the steps up to a horizon; FDE: distance at it (Ben-Younes et al. 2022, section 4;
 nuscenes-devkit ``mean_distances``, ``final_distances``).
@@ -10,11 +10,11 @@ from model.arrays import Floats
 from model.scenes.scene import STEP_SECONDS
 
 HORIZONS_S = (1, 2, 3, 4, 5, 6)
-"""Those of the paper's tables."""
+"""Horizons of the paper's tables, s."""
 
 
 def displacement_m(forecast: Floats, truth: Floats) -> Floats:
-    """Euclidean distance at each step.
+    """Return the Euclidean distance at each step.
 
     Args:
         forecast: [..., T, 2], m.
@@ -23,17 +23,17 @@ def displacement_m(forecast: Floats, truth: Floats) -> Floats:
     Returns:
         [..., T], m; NaN where either is not finite.
     """
-    with np.errstate(invalid="ignore"):  # infinity less infinity
+    with np.errstate(invalid="ignore"):  # infinity minus infinity
         offset = forecast - truth
     distance: Floats = np.hypot(offset[..., 0], offset[..., 1])
     return np.where(np.isfinite(distance), distance, np.nan)
 
 
 def horizon_steps(horizon_s: float) -> int:
-    """How many steps of a forecast a horizon takes.
+    """Return the number of steps up to a horizon.
 
     Raises:
-        ValueError: it is no positive multiple of the step, 0.5 s.
+        ValueError: the horizon is no positive multiple of the step, 0.5 s.
     """
     steps = horizon_s / STEP_SECONDS
     if not (steps >= 1 and steps == int(steps)):
@@ -42,15 +42,15 @@ def horizon_steps(horizon_s: float) -> int:
 
 
 def horizons_within(steps: int) -> tuple[int, ...]:
-    """Those of ``HORIZONS_S`` that a forecast of so many steps reaches, s."""
+    """Return those of ``HORIZONS_S`` that a forecast of so many steps reaches, s."""
     return tuple(h for h in HORIZONS_S if horizon_steps(h) <= steps)
 
 
 def ade_m(errors_m: Floats, horizon_s: float) -> Floats:
-    """Mean distance over the steps up to a horizon.
+    """Return the mean distance over the steps up to a horizon.
 
     Args:
-        errors_m: [..., T], of ``displacement_m``.
+        errors_m: [..., T], from ``displacement_m``.
         horizon_s: s.
 
     Returns:
@@ -63,12 +63,12 @@ def ade_m(errors_m: Floats, horizon_s: float) -> Floats:
 
 
 def fde_m(errors_m: Floats, horizon_s: float) -> Floats:
-    """Distance at a horizon: [...], m. Arguments and errors as for ``ade_m``; NaN where that step is."""
+    """Return the distance at a horizon: [...], m; NaN where that step is. Otherwise as ``ade_m``."""
     return np.asarray(errors_m[..., _steps_within(errors_m, horizon_s) - 1])
 
 
 def expected_displacement_m(samples: Floats, truth: Floats) -> Floats:
-    """Distance at each step, averaged over trajectories drawn from the whole forecast (the paper: 2000).
+    """Return the distance at each step, averaged over trajectories drawn from the forecast (the paper: 2000).
 
     ``ade_m`` and ``fde_m`` of it are ADE-f and FDE-f: the mean over samples and that over steps commute.
 
@@ -80,16 +80,6 @@ def expected_displacement_m(samples: Floats, truth: Floats) -> Floats:
         [N, T], m; NaN where the truth or a sample is not finite.
     """
     return np.asarray(displacement_m(samples, truth[:, None]).mean(axis=1))
-
-
-def expected_ade_m(samples: Floats, truth: Floats, horizon_s: float) -> Floats:
-    """ADE-f up to a horizon: [N], m; NaN where one of the steps is. Arguments as above."""
-    return ade_m(expected_displacement_m(samples, truth), horizon_s)
-
-
-def expected_fde_m(samples: Floats, truth: Floats, horizon_s: float) -> Floats:
-    """FDE-f at a horizon: [N], m; NaN where that step is. Arguments as above."""
-    return fde_m(expected_displacement_m(samples, truth), horizon_s)
 
 
 def _steps_within(errors_m: Floats, horizon_s: float) -> int:

@@ -1,4 +1,4 @@
-"""Every per-instance metric of one batch of forecasts, under names that stay."""
+"""All metrics of a batch of forecasts, per instance, under stable names."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -14,12 +14,12 @@ SAMPLES: Final = 2000
 """Trajectories that the paper draws for ADE-f, FDE-f and OffR-f."""
 
 MERGED_SHARE: Final = 0.9
-"""Of the probability; ``merged_modes_90`` counts the merged modes that hold it."""
+"""Share of the probability; ``merged_modes_90`` is the number of merged modes that hold it."""
 MERGED_TOP_K: Final = (5, 10)
-"""Merged modes that count; the best of one is the likeliest, which has figures by horizon."""
+"""k of figures of merged modes; for k = 1 there are figures by horizon."""
 
 MOVING: Final = "moving_"
-"""Begins the names of figures without the agents that stood."""
+"""Prefix of figures without the agents that stood."""
 MOVING_FIGURES: Final = (
     "ade_ml_6s_m",
     "fde_ml_6s_m",
@@ -37,14 +37,14 @@ MOVING_FIGURES: Final = (
     "ade_merged_6s_m",
     "fde_merged_6s_m",
 )
-"""The figures that are told without the agents that stood, too."""
+"""Figures that are also given without the agents that stood."""
 
 LEAVING_M: Final = 2.0
 LEAVING_STEP: Final = 6
-"""A mode leaves that is more than 2 m away after 3 s: of standing agents hardly any should."""
+"""A mode leaves if it is more than 2 m away after 3 s, as hardly any should for standing agents."""
 
 _CHUNK_POINTS: Final = 1 << 18
-"""Sampled positions looked at at once."""
+"""Sampled positions evaluated at once."""
 
 
 def instance_metrics(
@@ -58,42 +58,43 @@ def instance_metrics(
     noise_m: float = density.LABEL_NOISE_M,
     stood: Bools | None = None,
 ) -> dict[str, Floats]:
-    """Metrics of N forecasts, each [N]; their means over instances are the figures of the tables.
+    """Return metrics of N forecasts by name, each [N]; their means over instances are the tables' figures.
 
-    For h in 1 … 6 (as far as T reaches), k in 1, 5, 10, p in 50, 90, 99; "whole" is up to step T:
+    For h in 1 … 6 (up to T), k in 1, 5, 10, p in 50, 90, 99; "whole" is up to step T:
 
-    - ``ade_ml_{h}s_m``, ``fde_ml_{h}s_m``: m, of the most likely trajectory.
+    - ``ade_ml_{h}s_m``, ``fde_ml_{h}s_m``: m, for the most likely trajectory.
     - ``min_ade_{k}_m``, ``min_fde_{k}_m``, ``miss_rate_{k}``: whole, as in nuscenes-devkit.
-    - of the merged modes (``model.mixture.merge_modes``): ``ade_merged_{h}s_m``, ``fde_merged_{h}s_m``: m, of
-      the likeliest; for k in 5, 10 ``merged_min_ade_{k}_m``, ``merged_min_fde_{k}_m``,
-      ``merged_miss_rate_{k}`` and ``merged_brier_min_fde_{k}_m``; ``merged_modes_90``: how many hold 90 % of
-      the probability; ``merged_first_weight``: of the likeliest. Everything else is of the modes as they are.
+    - for the merged modes (``model.mixture.merge_modes``): ``ade_merged_{h}s_m``, ``fde_merged_{h}s_m``: m,
+      for the likeliest; for k in 5, 10 ``merged_min_ade_{k}_m``, ``merged_min_fde_{k}_m``,
+      ``merged_miss_rate_{k}`` and ``merged_brier_min_fde_{k}_m``; ``merged_modes_90``: number that hold 90 %
+      of the probability; ``merged_first_weight``: weight of the likeliest. All other metrics are of the modes
+      as forecast.
     - ``leaving_weight_3s``: probability of the modes that are more than ``LEAVING_M`` from now after 3 s.
-    - ``nll``: nats, mean over the steps; ``nll_{h}s``: at that step; ``nll_joint``: whole trajectory. Of the
-      labelled position: the mixture is widened by ``noise_m`` (see ``density``).
+    - ``nll``: nats, mean over the steps; ``nll_{h}s``: at that step; ``nll_joint``: whole trajectory. They
+      are for the labelled position: the mixture is widened by ``noise_m`` (see ``density``).
     - with rasters: ``off_road_ml``: 1 or 0, the most likely trajectory; NaN without a map.
     - with seeds and ``samples``: ``ade_f_{h}s_m``, ``fde_f_{h}s_m``: m, mean over the samples; with rasters
       also ``off_road_f``, share of the samples.
     - with seeds and ``draws``: ``inside_{p}``: share of the steps at which the truth lies inside the p %
       highest-density region of the widened mixture; ``inside_{p}_{h}s``: 1 or 0, at that step.
-    - with ``stood``: ``moving_{figure}``, each of ``MOVING_FIGURES`` that is there, NaN for who stood.
+    - with ``stood``: ``moving_{figure}``, for each of ``MOVING_FIGURES``; NaN for agents that stood.
 
-    An instance with a step of the truth that is not finite gets NaN wherever that step counts.
+    Where a step of the truth is not finite, the metrics that use it are NaN.
 
     Args:
-        mixture: of N agents, K modes, T steps; on any device.
+        mixture: forecasts of N agents, K modes, T steps; on any device.
         truth: [N, T, 2], m, ground frame.
         rasters: N maps (instances of a scene may share one), or None for no off-road rates.
-        seeds: N, one an instance, fixed by the instance and not by its place in a batch, so that figures do
-            not hang on batching; or None for no sampled metrics.
-        samples: S of ADE-f, FDE-f and OffR-f; 0 for none of them.
-        draws: for calibration; 0 for none.
-        noise_m: standard deviation of labelled positions, m, for likelihood and calibration; 0 for the plain
+        seeds: N seeds, determined by the instance and not by its place in a batch, so that figures do not
+            depend on batching; or None for no sampled metrics.
+        samples: S, trajectories drawn for ADE-f, FDE-f and OffR-f; 0: none of these.
+        draws: positions drawn for calibration; 0: no calibration.
+        noise_m: standard deviation of labelled positions, m, for likelihood and calibration; 0: the plain
             mixture.
-        stood: [N], of ``standing.stood``; None for no figures without those.
+        stood: [N], from ``standing.stood``; None: no figures for moving agents.
 
     Raises:
-        ValueError: sizes do not fit, or N is 0.
+        ValueError: sizes do not match, or N is 0.
     """
     count, _, steps = mixture.means.shape[:3]
     if not count:
@@ -136,7 +137,7 @@ def instance_metrics(
 
 
 def _merged(mixture: TrajectoryMixture, truth: Floats) -> dict[str, Floats]:
-    """Figures of the merged modes. Padding does no harm: it ranks last, and repeats a mode that is there."""
+    """Return metrics of merged modes. Padding is harmless: it ranks last and repeats an existing mode."""
     merged = merge_modes(mixture).mixture
     likeliest = merged.most_likely_trajectory().numpy()
     result = _by_horizon("merged", displacement.displacement_m(likeliest, truth))
@@ -152,7 +153,7 @@ def _merged(mixture: TrajectoryMixture, truth: Floats) -> dict[str, Floats]:
 
 
 def _by_horizon(kind: str, errors_m: Floats) -> dict[str, Floats]:
-    """ADE and FDE from errors [N, T]."""
+    """Return ADE and FDE from errors [N, T], m."""
     result = {}
     for h in displacement.horizons_within(errors_m.shape[1]):
         result[f"ade_{kind}_{h}s_m"] = displacement.ade_m(errors_m, h)
@@ -175,7 +176,7 @@ def _sampled(
     seeds: Sequence[int],
     samples: int,
 ) -> dict[str, Floats]:
-    """Some instances at a time: all samples of a large batch would fill the memory."""
+    """Return sampled metrics, computed in chunks: the samples of a large batch would not fit into memory."""
     parts = []
     chunk = max(1, _CHUNK_POINTS // (samples * truth.shape[1]))
     for start in range(0, len(truth), chunk):

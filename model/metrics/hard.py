@@ -1,26 +1,26 @@
-"""Hard cases: the instances that a Kalman filter mistakes most (Ben-Younes et al. 2022, section 4)."""
+"""Hard cases: instances with the largest errors of a Kalman filter (Ben-Younes et al. 2022, section 4)."""
 
 import numpy as np
 
 from model.arrays import Bools, Floats
 
 HARD_SHARES = (0.01, 0.02, 0.03)
-"""Those of the paper's table."""
+"""Shares of the paper's table."""
 
 
 def hardest(mismatch_m: Floats, share: float) -> Bools:
-    """Marks the share of instances with the greatest mismatch.
+    """Mark the share of instances with the largest mismatch.
 
-    So many as the share is of N, rounded, and at least one; of equals the first. A smaller share's instances
-    are among a greater one's.
+    Their number is the share of N, rounded, at least one; ties go to the first. The instances of a smaller
+    share are among those of a larger one.
 
     Args:
-        mismatch_m: [N], m: how far the Kalman filter's forecast is from the truth at 6 s
+        mismatch_m: [N], m, distance of the Kalman filter's forecast from the truth at 6 s
             (``displacement.fde_m``).
         share: in (0, 1].
 
     Returns:
-        [N].
+        [N], whether an instance is among them.
 
     Raises:
         ValueError: the share is outside its bounds, or a mismatch is not finite and so has no rank.

@@ -1,4 +1,4 @@
-"""The best of the k most probable modes, as nuscenes-devkit has it (``eval/prediction/metrics.py``)."""
+"""Metrics of the k most probable modes, as in nuscenes-devkit (``eval/prediction/metrics.py``)."""
 
 import numpy as np
 
@@ -6,27 +6,27 @@ from model.arrays import Floats, Ints
 from model.metrics.displacement import displacement_m
 
 TOP_K = (1, 5, 10)
-"""What nuScenes' challenge reports."""
+"""k of nuScenes' challenge."""
 MISS_TOLERANCE_M = 2.0
-"""A mode misses that is anywhere this far from the truth, or farther."""
+"""A mode misses if it is this far from the truth, or farther, at any step."""
 
 
 def by_probability(probabilities: Floats) -> Ints:
-    """The modes' indices, most probable first: [N, K] → [N, K].
+    """Return the modes' indices, most probable first: [N, K] → [N, K].
 
-    Of equal ones the last comes first. So it is in the devkit for up to 16 modes, where the sort that it
-    calls is stable; with more it leaves ties to numpy's version and the processor, and this does not.
+    Among ties the last comes first. This equals the devkit for up to 16 modes, for which its sort is stable;
+    with more, the devkit's order of ties depends on numpy's version and the processor.
     """
     return np.flip(np.argsort(probabilities, axis=-1, kind="stable"), axis=-1).astype(np.int64)
 
 
 def best_of_top_k(values: Floats, probabilities: Floats, k: int) -> Floats:
-    """The least value among the k most probable modes (devkit ``rank_metric_over_top_k_modes``, "min").
+    """Return the minimum over the k most probable modes (devkit ``rank_metric_over_top_k_modes``, "min").
 
     Args:
         values: [N, K], any unit.
         probabilities: [N, K]; their scale does not matter.
-        k: at least 1; with fewer modes, all of them count.
+        k: number of modes, at least 1; with fewer modes, all of them count.
 
     Returns:
         [N]; NaN where one of those k values is NaN, or one of the K probabilities is not finite.
@@ -41,13 +41,13 @@ def best_of_top_k(values: Floats, probabilities: Floats, k: int) -> Floats:
 
 
 def min_ade_m(modes: Floats, probabilities: Floats, truth: Floats, k: int) -> Floats:
-    """minADE_k: the least mean distance (devkit ``MinADEK``).
+    """Return minADE_k, the minimum of the mean distance (devkit ``MinADEK``).
 
     Args:
         modes: [N, K, T, 2], m.
         probabilities: [N, K].
         truth: [N, T, 2], m.
-        k: how many modes count.
+        k: number of modes that count.
 
     Returns:
         [N], m; NaN as in ``best_of_top_k``.
@@ -56,16 +56,16 @@ def min_ade_m(modes: Floats, probabilities: Floats, truth: Floats, k: int) -> Fl
 
 
 def min_fde_m(modes: Floats, probabilities: Floats, truth: Floats, k: int) -> Floats:
-    """minFDE_k: the least distance at the last step (devkit ``MinFDEK``): [N], m. As ``min_ade_m``."""
+    """Return minFDE_k, the minimum final distance (devkit ``MinFDEK``): [N], m, as ``min_ade_m``."""
     return best_of_top_k(_errors_m(modes, truth)[..., -1], probabilities, k)
 
 
 def missed(
     modes: Floats, probabilities: Floats, truth: Floats, k: int, tolerance_m: float = MISS_TOLERANCE_M
 ) -> Floats:
-    """Whether every one of the k modes misses (devkit ``MissRateTopK``); the mean is the miss rate.
+    """Return whether all of the k modes miss (devkit ``MissRateTopK``); the mean is the miss rate.
 
-    A mode misses whose greatest distance from the truth is the tolerance or more.
+    A mode misses if its maximum distance from the truth is the tolerance or more.
 
     Returns:
         [N], 1 or 0; NaN as in ``min_ade_m``. Arguments as there.
@@ -76,13 +76,13 @@ def missed(
 
 
 def brier_min_fde_m(modes: Floats, probabilities: Floats, truth: Floats, k: int) -> Floats:
-    """brier-minFDE_k: minFDE_k and (1 − p)², p the probability of the mode that is nearest at the last step.
+    """Return brier-minFDE_k: minFDE_k + (1 − p)², p the probability of the mode nearest at the last step.
 
-    As Argoverse has it: it asks of the mode that comes true that it was held probable. Of modes equally near
-    the most probable counts.
+    The definition is Argoverse's; it rewards a high probability of the mode that comes true. Among equally
+    near modes the most probable counts.
 
     Returns:
-        [N], m and a number from 0 to 1 added; NaN as in ``min_ade_m``. Arguments as there; probabilities sum
+        [N], m, plus a number from 0 to 1; NaN as in ``min_ade_m``. Arguments as there; probabilities sum
         to 1 over all K modes, not over the k.
     """
     errors_m = _errors_m(modes, truth)[..., -1]
@@ -93,7 +93,7 @@ def brier_min_fde_m(modes: Floats, probabilities: Floats, truth: Floats, k: int)
 
 
 def modes_holding(probabilities: Floats, share: float) -> Floats:
-    """Return how many modes, the most probable first, together hold a share of the probability: [N].
+    """Return the number of most probable modes that together hold a share of the probability: [N].
 
     Args:
         probabilities: [N, K], summing to 1; zero for modes that are padding.
@@ -105,5 +105,5 @@ def modes_holding(probabilities: Floats, share: float) -> Floats:
 
 
 def _errors_m(modes: Floats, truth: Floats) -> Floats:
-    """[N, K, T], m."""
+    """Return distances [N, K, T], m."""
     return displacement_m(modes, truth[:, None])

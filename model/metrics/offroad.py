@@ -1,7 +1,7 @@
-"""Off-road rates: how many trajectories leave the driveable area (OffR; Ben-Younes et al. 2022, section 4).
+"""Off-road rates: share of trajectories that leave the driveable area (OffR; Ben-Younes et al. 2022, sec. 4).
 
 A point is off the road where the nearest pixel of the driveable layer is 0, and outside the raster; a
-trajectory is, if one of its T points is. At 3 pixels a metre an edge is so known to 0.17 m.
+trajectory is off the road if one of its T points is. At 3 pixels a metre, edges are accurate to 0.17 m.
 ``offroad_devkit`` has nuscenes-devkit's definition, which differs.
 """
 
@@ -16,7 +16,7 @@ DRIVEABLE_LAYER = 0
 
 
 def driveable(raster: Raster, points: Floats) -> Bools:
-    """Whether points lie on the driveable area: [...]; not finite ones do not.
+    """Return whether points lie on the driveable area: [...]; points that are not finite do not.
 
     Args:
         raster: the scene's map.
@@ -35,7 +35,7 @@ def driveable(raster: Raster, points: Floats) -> Bools:
 
 
 def off_road(raster: Raster, trajectories: Floats) -> Floats:
-    """Whether trajectories leave the driveable area at any of their points.
+    """Return whether trajectories leave the driveable area at any of their points.
 
     Args:
         raster: the scene's map.
@@ -50,7 +50,7 @@ def off_road(raster: Raster, trajectories: Floats) -> Floats:
 
 
 def off_road_of_each(rasters: Sequence[Raster | None], trajectories: Floats) -> Floats:
-    """``off_road`` for instances on maps of their own.
+    """Return ``off_road`` of instances on maps of their own.
 
     Args:
         rasters: N, one an instance (instances of one scene may share one); None: no map.
@@ -60,7 +60,7 @@ def off_road_of_each(rasters: Sequence[Raster | None], trajectories: Floats) -> 
         [N, ...]; NaN without a map.
 
     Raises:
-        ValueError: there are not N rasters.
+        ValueError: the number of rasters is not N.
     """
     if len(rasters) != len(trajectories):
         raise ValueError(f"{len(trajectories)} instances need as many rasters, not {len(rasters)}")
@@ -76,7 +76,7 @@ def off_road_of_each(rasters: Sequence[Raster | None], trajectories: Floats) -> 
 
 
 def expected_off_road(rasters: Sequence[Raster | None], samples: Floats) -> Floats:
-    """OffR-f: the share of trajectories drawn from the forecast that leave the driveable area.
+    """Return OffR-f, the share of trajectories drawn from the forecast that leave the driveable area.
 
     Args:
         rasters: N, one an instance; None: no map.

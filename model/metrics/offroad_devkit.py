@@ -1,12 +1,12 @@
 """nuscenes-devkit's off-road rate (``eval/prediction/metrics.py``, ``OffRoadRate``), for comparison.
 
-It differs from ``offroad`` in three ways: the modes of an instance count alike, whatever their
-probabilities; a cubic smoothing spline of 200 points through a trajectory is looked at instead of its
-points (also those between them, then, and close to them rather than at them); and a point belongs to the
-pixel that its coordinates are cut to, not to the nearest. On the devkit's own mask (driveable area only, 10
-pixels a metre, the whole city, origin 0; its rows run along y, ours along x) the figures are equal.
+It differs from ``offroad`` in three ways. The modes of an instance have equal weight, whatever their
+probabilities. Instead of a trajectory's points, 200 points on a cubic smoothing spline through them are
+tested, which lie also between the points, and only close to them. And coordinates are truncated to a pixel,
+not rounded to the nearest. On the devkit's own mask (driveable area only, 10 pixels a metre, the whole city,
+origin 0; its rows run along y, ours along x) the figures are equal.
 
-Needs scipy, which comes with the devkit and not with this package.
+This needs scipy, which comes with the devkit and not with this package.
 """
 
 import importlib
@@ -18,13 +18,13 @@ from model.metrics.offroad import DRIVEABLE_LAYER
 from model.scenes.scene import Raster
 
 POINTS = 200
-"""On a spline."""
+"""Points on a spline."""
 SMOOTHING_M2 = 0.1
-"""Sum of squared distances by which the spline may miss the trajectory's points."""
+"""Maximum sum of squared distances between the spline and the trajectory's points."""
 
 
 def off_road_rate_devkit(raster: Raster, modes: Floats) -> float:
-    """The share of one instance's modes that leave the driveable area.
+    """Return the share of one instance's modes that leave the driveable area.
 
     Args:
         raster: the map.
@@ -48,7 +48,7 @@ def off_road_rate_devkit(raster: Raster, modes: Floats) -> float:
 
 
 def _spline(trajectory: Floats) -> Floats:
-    """[T, 2] → [200, 2], or the distinct points where there are three or fewer."""
+    """Return points on a spline: [T, 2] → [200, 2], or the distinct points if there are three or fewer."""
     points = np.array(list(dict.fromkeys(map(tuple, trajectory.tolist()))))
     if len(points) <= 3:
         return points

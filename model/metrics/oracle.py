@@ -1,4 +1,4 @@
-"""The physics oracle: of several physics forecasts the one that turned out best. It needs the truth."""
+"""The physics oracle: the best of several physics forecasts, chosen with knowledge of the truth."""
 
 from collections.abc import Mapping
 from enum import StrEnum
@@ -13,47 +13,47 @@ from model.metrics.evaluate import MOVING
 from model.mixture import TrajectoryMixture
 
 ORACLE = "physics-oracle"
-"""Its name in tables."""
+"""Name in tables."""
 PHYSICS = (
     "constant-velocity-yaw",
     "constant-speed-yaw-rate",
     "constant-acceleration-yaw",
     "constant-acceleration-yaw-rate",
 )
-"""Names of the models that it chooses from, in the order that settles ties."""
+"""Names of the models from which it chooses, in the order that settles ties."""
 
 _LIKELIEST = ("ade_ml_", "fde_ml_", "off_road_ml")
 _OF_THE_LIKELIEST = (*_LIKELIEST, *(f"{MOVING}{name}" for name in _LIKELIEST))
 
 
 class Criterion(StrEnum):
-    """What "best" is measured by."""
+    """Criterion of the choice."""
 
     MEAN_DISTANCE = "mean_distance"
-    """As the challenge and the paper describe it."""
+    """Mean distance, as the challenge and the paper describe it."""
     RMS_DISTANCE = "rms_distance"
-    """As nuscenes-devkit's ``PhysicsOracle`` computes it (the Frobenius norm of the difference)."""
+    """RMS distance, as nuscenes-devkit's ``PhysicsOracle`` computes it (Frobenius norm of the difference)."""
 
 
 class OracleChoice(NamedTuple):
-    """What the oracle took."""
+    """Choice of the oracle."""
 
     choice: Ints
-    """[N], which of the M forecasts; −1 where none could be measured."""
+    """[N], index among the M forecasts; −1 where none could be measured."""
     trajectory: Floats
-    """[N, T, 2], m, that forecast; NaN without one."""
+    """[N, T, 2], m, the chosen forecast; NaN without one."""
 
 
 def physics_oracle(
     forecasts: Floats, truth: Floats, criterion: Criterion = Criterion.MEAN_DISTANCE
 ) -> OracleChoice:
-    """Chooses for each instance the forecast nearest to the truth, the first of equals.
+    """Choose for each instance the forecast nearest to the truth; ties go to the first.
 
     Args:
         forecasts: [N, M, T, 2], m, ground frame; one with a point that is not finite is not chosen.
-        truth: [N, T, 2], m, ground frame. Steps that are not finite do not count: so near the end of a
-            track the choice is made by what there is.
-        criterion: what is least.
+        truth: [N, T, 2], m, ground frame. Steps that are not finite do not count, so that near the end
+            of a track the choice depends on the steps that there are.
+        criterion: criterion that the choice minimises.
     """
     usable = np.asarray(np.isfinite(forecasts).all(axis=(-2, -1)))  # [N, M]
     seen = np.asarray(np.isfinite(truth).all(axis=-1))  # [N, T]
@@ -73,10 +73,11 @@ def physics_oracle(
 
 
 def oracle_mixture(mixtures: Mapping[str, TrajectoryMixture], truth: Floats) -> TrajectoryMixture:
-    """Of the four physics forecasts of each pair, the one nearest to the truth on the mean.
+    """Return, for each pair, the physics forecast with the smallest mean distance from the truth.
 
     Args:
-        mixtures: by the models' names, of N pairs, one mode; others than physics are left aside.
+        mixtures: forecasts of N pairs, of one mode, by the models' names; models other than physics are
+            ignored.
         truth: [N, T, 2], m, ground frame, finite.
     """
     four = [mixtures[name] for name in PHYSICS]
@@ -92,6 +93,5 @@ def oracle_mixture(mixtures: Mapping[str, TrajectoryMixture], truth: Floats) -> 
 
 
 def oracle_figures(metrics: Mapping[str, Floats]) -> dict[str, Floats]:
-    """Those of ``instance_metrics`` that mean something of the oracle: it states one trajectory, and no
-    density that could be judged."""
+    """Return those of ``instance_metrics`` that are meaningful for the oracle, which has no density."""
     return {name: values for name, values in metrics.items() if name.startswith(_OF_THE_LIKELIEST)}

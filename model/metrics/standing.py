@@ -1,4 +1,4 @@
-"""Who stood before now: as the challenge picks agents that move, these are unlike others that stand."""
+"""Agents that stood before now; as the challenge selects moving agents, they are unlike other ones."""
 
 from typing import Final
 
@@ -7,17 +7,17 @@ import numpy as np
 from model.arrays import Bools, Floats
 
 STANDING_FRAMES: Final = 4
-"""Frames of 0.5 s before now that are looked at: 2 s."""
+"""Number of frames of 0.5 s before now that count: 2 s."""
 STANDING_M: Final = 0.3
-"""m; who was never so far from where it is now stood. Of the pairs of nuScenes' train_val there are 354."""
+"""m; an agent that was always nearer to its present position stood. There are 354 in nuScenes' train_val."""
 
 
 def stood(positions: Floats) -> Bools:
-    """Return whether an agent stood for 2 s: it was seen at each frame, never 0.3 m from where it is now.
+    """Return whether agents stood for 2 s: seen at each frame, always within 0.3 m of the present position.
 
     Args:
-        positions: [..., F, 2], m, in any frame of reference, at 2 Hz, the last one now; NaN where it was not
-            seen. Of more than five frames the last five count.
+        positions: [..., F, 2], m, in any frame of reference, at 2 Hz, the last one now; NaN where not seen.
+            Of more than five frames the last five count.
 
     Returns:
         [...]; false where there are fewer than five frames.

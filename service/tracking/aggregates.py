@@ -5,13 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from model.arrays import Floats, Ints
-from model.metrics.convergence import RANGES_M
+from model.metrics.consistency import RANGES_M
 from service.tracking.metrics import InstantMetrics
 from service.tracking.quantile_sketch import Distribution, QuantileSketches
 from service.tracking.store.records import AGES
 
 DISPERSIONS = range(3)
-"""Indices of the dispersion metrics, in the order of ``model.metrics.dispersion.Dispersion``, m."""
+"""Indices of the dispersion metrics, in the order of ``model.metrics.consistency.Dispersion``, m."""
 CONVERGENCES = range(DISPERSIONS.stop, DISPERSIONS.stop + len(RANGES_M))
 """Indices of C(τ), one per range of ``RANGES_M``, s."""
 ERRORS = range(CONVERGENCES.stop, CONVERGENCES.stop + AGES)

@@ -8,7 +8,7 @@ from prometheus_client.core import HistogramMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from model.arrays import Floats
-from model.metrics.convergence import RANGES_M
+from model.metrics.consistency import RANGES_M
 from service.tracking.aggregates import CONVERGENCES, DISPERSIONS, ERRORS, Aggregates, ModelAggregate
 from service.tracking.metrics import AGES_S
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from cab.forecast.v1 import consistency_service_pb2 as pb
 from cab.forecast.v1 import model_service_pb2 as models_pb
-from model.metrics.convergence import RANGES_M
+from model.metrics.consistency import RANGES_M
 from service.tracking.aggregates import CONVERGENCES, DISPERSIONS, ERRORS, Aggregates, ModelAggregate
 from service.tracking.metrics import AGES_S, InstantMetrics
 from service.tracking.model_references import ModelReferences

@@ -9,8 +9,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from model.arrays import Bools, Floats
-from model.metrics.convergence import RANGES_M, convergence_s, errors_by_age_m
-from model.metrics.dispersion import Dispersion, dispersion
+from model.metrics.consistency import RANGES_M, Dispersion, convergence_s, dispersion, errors_by_age_m
 from model.metrics.displacement import displacement_m
 from model.scenes.resample import TIME_TOLERANCE
 from model.scenes.scene import STEP_SECONDS

@@ -10,7 +10,7 @@ from benchmark.hard import CaseForecast, HardCase
 from benchmark.models import BASELINES
 from benchmark.results import Latency, ModelResult, Results
 from model.forecaster import Protocol
-from model.metrics.convergence import RANGES_M
+from model.metrics.consistency import RANGES_M
 from model.metrics.evaluate import MOVING, MOVING_FIGURES
 from model.scenes.scene import Raster
 

@@ -101,7 +101,7 @@ def test_as_published(tmp_path: Path, settings: Path) -> None:
         ("cab", ("--train-split", "none"), "made:DIR", "none"),
         ("cab", ("--start", "{folder}/nothing"), "made:DIR", "nothing"),
         ("cab", ("--config", "{folder}/nothing.toml"), "made:DIR", "nothing.toml: cannot be read"),
-        ("cab", ("--config", "{settings}"), "made:DIR", "blind is none, but cab learns to forecast blindly"),
+        ("cab", ("--config", "{settings}"), "made:DIR", "blind is none, but cab trains a blind forecast"),
         ("trajectron", ("--config", "{settings}", "--learning-rate", "1e6"), "made:DIR", "has diverged"),
     ],
 )

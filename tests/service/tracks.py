@@ -12,9 +12,14 @@ from cab.forecast.v1 import model_service_pb2 as models
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from cab_forecast import AsyncClient, Status, forecasts
 from model.arrays import Floats
-from model.metrics.ages import complete, forecasts_by_age
-from model.metrics.convergence import RANGES_M, convergence_s, errors_by_age_m
-from model.metrics.dispersion import dispersion
+from model.metrics.consistency import (
+    RANGES_M,
+    complete,
+    convergence_s,
+    dispersion,
+    errors_by_age_m,
+    forecasts_by_age,
+)
 
 
 @dataclass(frozen=True)

@@ -224,12 +224,12 @@ def test_a_split_without_pairs(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("pair", "told"),
     [
-        (Pair(0, 0), "a0 at frame 0 is asked for but has no history"),
-        (Pair(0, 12), "a0 at frame 12 is asked for but has no whole future"),
-        (Pair(0, 24), "a0 at frame 24 is asked for but not annotated"),
-        (Pair(1, 5), "a1 at frame 5 is asked for but not annotated"),
-        (Pair(1, 3), "a1 at frame 3 is asked for but has no whole future"),
-        (Pair(4, 6), "a4 at frame 6 is asked for but is a pedestrian"),
+        (Pair(0, 0), "a0 at frame 0 is a pair but has no history"),
+        (Pair(0, 12), "a0 at frame 12 is a pair but has no whole future"),
+        (Pair(0, 24), "a0 at frame 24 is a pair but not annotated"),
+        (Pair(1, 5), "a1 at frame 5 is a pair but not annotated"),
+        (Pair(1, 3), "a1 at frame 3 is a pair but has no whole future"),
+        (Pair(4, 6), "a4 at frame 6 is a pair but is a pedestrian"),
     ],
 )
 def test_pairs_that_cannot_be_trained_on_are_refused(tmp_path: Path, pair: Pair, told: str) -> None:

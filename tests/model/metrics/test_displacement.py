@@ -57,10 +57,10 @@ def test_expected_errors_are_means_over_the_samples(samples: Floats) -> None:
     each = [displacement.displacement_m(samples[:, s], truth) for s in range(5)]
     for horizon in (1, 6):
         np.testing.assert_allclose(
-            displacement.expected_ade_m(samples, truth, horizon),
+            displacement.ade_m(displacement.expected_displacement_m(samples, truth), horizon),
             np.mean([displacement.ade_m(e, horizon) for e in each], axis=0),
         )
         np.testing.assert_allclose(
-            displacement.expected_fde_m(samples, truth, horizon),
+            displacement.fde_m(displacement.expected_displacement_m(samples, truth), horizon),
             np.mean([displacement.fde_m(e, horizon) for e in each], axis=0),
         )

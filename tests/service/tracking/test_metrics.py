@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.metrics.convergence import RANGES_M, convergence_s, errors_by_age_m
-from model.metrics.dispersion import dispersion
+from model.metrics.consistency import RANGES_M, convergence_s, dispersion, errors_by_age_m
 from service.tracking.metrics import AGES_S, instant_metrics
 from service.tracking.store.records import AGES, COMPLETE, INSTANT, MODES, NEWLY, SETTLED
 
