@@ -2,6 +2,7 @@
 
 import ast
 import asyncio
+import re
 import subprocess
 import sys
 import tomllib
@@ -71,6 +72,19 @@ def test_the_image_is_built_from_all_packages() -> None:
     assert copied == packages()
     sent = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
     assert packages() <= sent
+
+
+def test_the_makefile_names_modules_and_tests_that_exist() -> None:
+    text = (ROOT / "Makefile").read_text()
+    modules = re.findall(r"python -m ([\w.]+)", text)
+    own = [name for name in modules if name.partition(".")[0] in ours()]
+    assert own
+    for name in own:
+        assert any((ROOT / file).is_file() for file in files_of(name)), name
+    tests = re.findall(r"tests/\S+\.py", text)
+    assert tests
+    for file in tests:
+        assert (ROOT / file).is_file(), file
 
 
 def test_every_package_is_type_checked_and_says_so() -> None:
