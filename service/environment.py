@@ -1,4 +1,4 @@
-"""Environment variables that look like settings and are none."""
+"""Detection of misspelt environment variables: those that look like settings but are none."""
 
 import difflib
 import re
@@ -6,21 +6,22 @@ from collections.abc import Collection, Mapping
 
 PREFIX = "FORECAST_"
 CONFIG = PREFIX + "CONFIG"
-"""Names the settings' file."""
+"""Variable that names the settings file."""
 
-# Kubernetes (and Docker's links) tell every container of a service "forecast" by variables of its own.
+# Kubernetes (and Docker links) set such variables in every container for a service named "forecast".
 _SERVICE_LINK = re.compile(r"(.*_)?(SERVICE_HOST|SERVICE_PORT(_.*)?|PORT_\d+_(TCP|UDP|SCTP)(_.*)?)")
 _SERVICE_PORT = re.compile(r"(.*_)?PORT")
 _SERVICE_ADDRESS = ("tcp://", "udp://", "sctp://")
 
 
 def unknown_variable(environment: Mapping[str, str], settings: Collection[str]) -> str | None:
-    """What is wrong with the first variable that sets nothing, and what may have been meant; None where
-    all of them set something. Upper and lower case are the same, as they are to the settings.
+    """Return an error text for the first variable that is no setting, with the nearest setting; else None.
+
+    Case is ignored, as it is for the settings themselves.
 
     Args:
-        environment: all variables; those of other programs are passed over.
-        settings: names of the settings, in lower case.
+        environment: all variables; those of other programs are ignored.
+        settings: the names of the settings, in lower case.
     """
     known = {PREFIX + name.upper() for name in settings} | {CONFIG}
     for name, value in sorted(environment.items()):

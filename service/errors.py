@@ -1,8 +1,8 @@
 # ruff: noqa: N818 - rows of a table of errors, named as the contract names them
-"""Everything that can go wrong with a call: one table for both transports.
+"""Errors of calls: one table for both transports.
 
-The classes are the table's rows. A transport turns a row into its own form: gRPC into a google.rpc
-status with details, REST into problem+json (RFC 9457). Nothing here knows of either.
+Each class is a row of the table. gRPC encodes it as google.rpc.Status with details, REST as problem+json
+(RFC 9457). This module depends on neither.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ DOMAIN = "cab-forecast"
 
 @dataclass(frozen=True)
 class Fault:
-    """One field of a request that is wrong, and why."""
+    """An invalid field of a request, and why it is invalid."""
 
     field: str
     """Path in the request, e.g. "agents[3].states[1].x"."""
@@ -30,13 +30,13 @@ def id_too_long(an_id: str) -> str:
 
 
 class ServiceError(Exception):
-    """A call that gets no answer; the text is for the caller to read."""
+    """Error of a call; its text is sent to the caller."""
 
     code: ClassVar[str] = "INTERNAL"
     """Name of the gRPC status code."""
     http_status: ClassVar[int] = 500
     reason: ClassVar[str] = "INTERNAL"
-    """Machine-readable, UPPER_SNAKE; tells rows of one code apart."""
+    """Machine-readable reason, UPPER_SNAKE; distinguishes rows of the same code."""
     title: ClassVar[str] = "Internal error"
 
     def __init__(
@@ -44,9 +44,9 @@ class ServiceError(Exception):
     ) -> None:
         """
         Args:
-            detail: what is wrong in this call.
-            faults: the fields that are wrong.
-            retry_after: s until another try makes sense; None: do not retry.
+            detail: the text for the caller.
+            faults: the invalid fields.
+            retry_after: seconds until a retry makes sense; None: do not retry.
         """
         super().__init__(detail)
         self.detail = detail
@@ -55,12 +55,12 @@ class ServiceError(Exception):
 
     @classmethod
     def type_uri(cls) -> str:
-        """URI of the problem type."""
+        """Return the URI of the problem type."""
         return f"urn:{DOMAIN}:error:{cls.reason.lower().replace('_', '-')}"
 
 
 class BadFields(ServiceError):
-    """Fields of the request break the contract."""
+    """Error of a request with invalid fields."""
 
     code = "INVALID_ARGUMENT"
     http_status = 422
@@ -74,14 +74,14 @@ class BadFields(ServiceError):
 
 
 class BadField(BadFields):
-    """One field of the request breaks the contract."""
+    """Error of a request with one invalid field."""
 
     def __init__(self, field: str, detail: str) -> None:
         super().__init__([Fault(field, detail)])
 
 
 class Unauthenticated(ServiceError):
-    """No credentials, or wrong ones."""
+    """Error of a call with missing or wrong credentials."""
 
     code = "UNAUTHENTICATED"
     http_status = 401
@@ -90,7 +90,7 @@ class Unauthenticated(ServiceError):
 
 
 class UnknownModel(ServiceError):
-    """No loaded model has that name (and version)."""
+    """Error of a call for a model that is not loaded."""
 
     code = "NOT_FOUND"
     http_status = 404
@@ -99,7 +99,7 @@ class UnknownModel(ServiceError):
 
 
 class UnknownTrack(ServiceError):
-    """Nothing is remembered of that scene or agent."""
+    """Error of a call for a scene or agent that the track memory does not know."""
 
     code = "NOT_FOUND"
     http_status = 404
@@ -108,7 +108,7 @@ class UnknownTrack(ServiceError):
 
 
 class TooLarge(ServiceError):
-    """The request exceeds a size limit; another try would fail the same way."""
+    """Error of a request that exceeds a size limit; a retry would fail the same way."""
 
     code = "RESOURCE_EXHAUSTED"
     http_status = 413
@@ -117,7 +117,7 @@ class TooLarge(ServiceError):
 
 
 class Overloaded(ServiceError):
-    """The queue is full."""
+    """Error of a call that the server has no room for at the moment."""
 
     code = "RESOURCE_EXHAUSTED"
     http_status = 429
@@ -129,7 +129,7 @@ class Overloaded(ServiceError):
 
 
 class DeadlineExceeded(ServiceError):
-    """The deadline passed before a forecast was made."""
+    """Error of a call whose deadline passed before a forecast was made."""
 
     code = "DEADLINE_EXCEEDED"
     http_status = 504
@@ -138,7 +138,7 @@ class DeadlineExceeded(ServiceError):
 
 
 class Unavailable(ServiceError):
-    """The server is starting or draining."""
+    """Error of a call to a server that is not ready."""
 
     code = "UNAVAILABLE"
     http_status = 503
@@ -150,7 +150,7 @@ class Unavailable(ServiceError):
 
 
 class TrackingUnavailable(ServiceError):
-    """The track memory does not answer. Forecasts go on without it; this is for calls that are about it."""
+    """Error of a consistency call while the track memory does not respond; forecasts go on without it."""
 
     code = "UNAVAILABLE"
     http_status = 503
@@ -162,14 +162,14 @@ class TrackingUnavailable(ServiceError):
 
 
 class Internal(ServiceError):
-    """A fault of the server; what exactly is in its log, not in the answer."""
+    """Error of the server itself; details are in its log only."""
 
     def __init__(self, detail: str = "the server failed to answer; its log says why") -> None:
         super().__init__(detail)
 
 
 class NotFound(ServiceError):
-    """No such address (REST)."""
+    """Error of an unknown path (REST)."""
 
     code = "NOT_FOUND"
     http_status = 404
@@ -178,7 +178,7 @@ class NotFound(ServiceError):
 
 
 class MethodNotAllowed(ServiceError):
-    """The address does not know that method (REST)."""
+    """Error of a method that the path does not support (REST)."""
 
     code = "UNIMPLEMENTED"
     http_status = 405
@@ -187,7 +187,7 @@ class MethodNotAllowed(ServiceError):
 
 
 class NotAcceptable(ServiceError):
-    """The answer does not come in any type that the request accepts (REST)."""
+    """Error of a request that accepts no media type of the response (REST)."""
 
     code = "INVALID_ARGUMENT"
     http_status = 406
@@ -196,7 +196,7 @@ class NotAcceptable(ServiceError):
 
 
 class UnsupportedMediaType(ServiceError):
-    """The request's body is of a type that is not understood (REST)."""
+    """Error of a request body of an unsupported media type (REST)."""
 
     code = "INVALID_ARGUMENT"
     http_status = 415
@@ -220,4 +220,4 @@ TABLE: tuple[type[ServiceError], ...] = (
     NotAcceptable,
     UnsupportedMediaType,
 )
-"""All rows."""
+"""Rows of the table."""

@@ -1,12 +1,12 @@
-"""Where Redis is: the URL of one server, of Sentinels or of a cluster.
+"""Parsing of Redis URLs: of one server, of Sentinels or of a cluster.
 
 - ``redis://[[user]:password@]host[:port][/db]``: one server, port 6379.
-- ``redis+sentinel://[[user]:password@]host[:port],…/master-name[/db]``: the Sentinels, port 26379, and which
-  of the masters they watch; with ``?sentinel_username=…&sentinel_password=…`` if the Sentinels ask for them.
+- ``redis+sentinel://[[user]:password@]host[:port],…/master-name[/db]``: the Sentinels, port 26379, and the
+  name of the master; with ``?sentinel_username=…&sentinel_password=…`` if the Sentinels require them.
 - ``redis+cluster://[[user]:password@]host[:port],…``: some nodes of a cluster, port 6379.
 
-``rediss`` instead of ``redis`` is TLS, with ``?ca_file=…`` where the certificates are of no public authority.
-What is special in a URL is percent-encoded. Redis itself is not imported here: settings stay light.
+``rediss`` instead of ``redis`` means TLS, with ``?ca_file=…`` for certificates of a private authority.
+Special characters are percent-encoded. The redis package is not imported here, so that settings load fast.
 """
 
 import re
@@ -28,7 +28,7 @@ _UNPRINTED = re.compile(r"[\x00-\x20\x7f]")
 
 
 class Layout(Enum):
-    """How the servers stand to each other."""
+    """Layout of the Redis deployment."""
 
     SINGLE = "single"
     SENTINEL = "sentinel"
@@ -37,7 +37,7 @@ class Layout(Enum):
 
 @dataclass(frozen=True)
 class Endpoint:
-    """A server to ask."""
+    """Host and port of a server."""
 
     host: str
     """Name or IP address, IPv6 without brackets."""
@@ -50,24 +50,24 @@ class Endpoint:
 
 @dataclass(frozen=True)
 class RedisAddress:
-    """A Redis, whole; neither ``str`` nor ``repr`` tells its passwords."""
+    """Address of a Redis deployment; ``str`` and ``repr`` omit its passwords."""
 
     layout: Layout
     endpoints: tuple[Endpoint, ...]
-    """The server, the Sentinels, or nodes of the cluster; at least one."""
+    """The server, the Sentinels or nodes of the cluster; at least one."""
     tls: bool = False
     ca_file: str | None = None
-    """PEM file of the authorities that are trusted; None: the system's."""
+    """PEM file of the trusted authorities; None: those of the system."""
     user: str | None = None
-    """None: Redis's "default" user."""
+    """User; None: Redis's "default" user."""
     password: str | None = field(default=None, repr=False)
-    """None: none is asked for."""
+    """Password; None: none is required."""
     database: int = 0
     master_name: str = ""
-    """By which the Sentinels know the master; empty where there are none."""
+    """Name of the master at the Sentinels; empty without Sentinels."""
     sentinel_user: str | None = None
     sentinel_password: str | None = field(default=None, repr=False)
-    """Of the Sentinels themselves; None: none is asked for."""
+    """Password of the Sentinels themselves; None: none is required."""
 
     def __str__(self) -> str:
         scheme = "rediss" if self.tls else "redis"
@@ -80,11 +80,11 @@ class RedisAddress:
 
 
 def parse_address(text: str) -> RedisAddress:
-    """The address that a URL gives.
+    """Return the address that a URL encodes.
 
     Raises:
-        ValueError: it gives none. The text says why, but nothing of what was given: anywhere in it there may
-            be a password.
+        ValueError: the URL is invalid. The text says why but quotes nothing of the URL, because any part of
+            it may be a password.
     """
     if _UNPRINTED.search(text):
         raise ValueError("a Redis URL has no blanks; percent-encode them")
@@ -101,7 +101,7 @@ def parse_address(text: str) -> RedisAddress:
     tls = matched[1] == "rediss"
     location, _, query = rest.partition("?")
     authority, _, path = location.partition("/")
-    # The last "@" is the one before the hosts, as in other parsers; there may be one in the password.
+    # The last "@" ends the credentials, as in other parsers; the password may contain another.
     credentials, at, hosts = authority.rpartition("@")
     user, password = _parse_credentials(credentials) if at else (None, None)
     parameters = _parse_query(query)
@@ -129,10 +129,10 @@ def parse_address(text: str) -> RedisAddress:
 
 
 def _parse_credentials(text: str) -> tuple[str | None, str]:
-    """User and password of USER:PASSWORD or :PASSWORD.
+    """Return user and password of USER:PASSWORD or :PASSWORD.
 
-    A lone word is refused, as some take it for the user and some for the password. So is an empty password,
-    which would be none where somebody meant to give one.
+    A single word is refused, because some parsers take it for the user and some for the password. An empty
+    password is refused too: it would mean no password where one was intended.
     """
     user, colon, password = text.partition(":")
     if not colon or not password:
@@ -170,7 +170,7 @@ def _parse_port(text: str) -> int:
 
 
 def _parse_path(layout: Layout, text: str) -> tuple[str, int]:
-    """Master's name and database."""
+    """Return the master's name and the database."""
     parts = text.removesuffix("/").split("/") if text else []
     if layout is Layout.CLUSTER:
         if any(parts):
@@ -190,7 +190,7 @@ def _parse_path(layout: Layout, text: str) -> tuple[str, int]:
 
 
 def _parse_number(text: str) -> int | None:
-    """Of ASCII digits, and not of too many; None: it is something else."""
+    """Return the number of up to nine ASCII digits; None if the text is anything else."""
     return int(text) if text.isascii() and text.isdecimal() and len(text) <= 9 else None
 
 

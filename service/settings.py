@@ -1,4 +1,4 @@
-"""Settings of the server: flags over ``FORECAST_*`` over a TOML file over defaults."""
+"""Settings of the server, by priority: flags, ``FORECAST_*`` variables, a TOML file, defaults."""
 
 import os
 from collections.abc import Sequence
@@ -19,69 +19,70 @@ from service.environment import CONFIG, PREFIX, unknown_variable
 from service.redis_url import parse_address
 
 FALLBACK_MODEL = "constant-velocity-yaw"
-"""The model of agents that the model asked for cannot forecast."""
+"""Model that forecasts the agents that the requested model cannot forecast."""
 
 
 class SettingsError(Exception):
-    """The settings make no sense; the text says which and why."""
+    """Error of invalid settings; the text names the setting and says why."""
 
 
 class Settings(BaseSettings):
-    """What an operator can set. Every name is an environment variable too: ``http`` is ``FORECAST_HTTP``."""
+    """Settings for operators. Each is also an environment variable: ``http`` is ``FORECAST_HTTP``."""
 
     model_config = SettingsConfigDict(env_prefix=PREFIX, extra="forbid", frozen=True, protected_namespaces=())
 
     http: str = "127.0.0.1:8080"
-    """HOST:PORT of REST; port 0 takes a free one."""
+    """HOST:PORT of REST; port 0: any free port."""
     grpc: str = "127.0.0.1:50051"
-    """HOST:PORT of gRPC; port 0 takes a free one."""
+    """HOST:PORT of gRPC; port 0: any free port."""
     store: str = Field(default="memory", repr=False)
-    """Where agents are remembered: "memory", in this process, or Redis 7 (see ``service.redis_url``):
-    redis:// and rediss:// of one server, redis+sentinel:// and redis+cluster://."""
+    """Track memory: "memory" (this process) or the URL of a Redis 7 (see ``service.redis_url``): redis:// or
+    rediss:// for one server, redis+sentinel:// or redis+cluster://."""
     store_budget_ms: float = Field(default=20.0, gt=0)
-    """ms that a call waits for the track memory; later the forecast goes out without it."""
+    """Max time in ms that a call waits for the track memory; then the forecast is sent without tracking."""
     store_timeout_ms: float = Field(default=500.0, gt=0)
-    """ms after which Redis is taken not to answer at all."""
+    """Timeout in ms of a Redis command."""
     store_connections: int = Field(default=16, ge=1)
-    """Connections to each Redis server for calls, at most; those who watch have their own."""
+    """Max number of connections to each Redis server for calls; streams of events have their own."""
     track_expiry: float = Field(default=30.0, ge=10.0)
-    """s without a call of a scene after which it is forgotten."""
+    """Seconds without a call after which a scene is forgotten."""
     max_tracked_agents: int = Field(default=5_000, ge=1)
-    """Agents that this process has in memory; beyond it the scenes without a call for the longest time go.
-    With Redis they are read again when they are called for."""
+    """Max number of agents that this process keeps in memory; beyond it the scenes that were called longest
+    ago are evicted. With Redis they are read again at their next call."""
     models: Path | None = None
     """Folder of checkpoints; None: the bundled ones, if any."""
     default_model: str | None = None
-    """The model of requests that name none; None: "cab" if loaded, else "kalman"."""
+    """Model of requests that name none; None: "cab" if loaded, else "kalman"."""
     allow_paper_protocol: bool = False
-    """Load models trained by the paper protocol, too; they warn in every answer. Otherwise they are passed
-    over, and a folder that holds no others is refused."""
+    """Flag for loading models trained by the paper protocol, which warn in every response. Otherwise they are
+    skipped, and a folder without other models is refused."""
     api_tokens: Annotated[tuple[SecretStr, ...], NoDecode] = ()
-    """Bearer tokens that are let in; not set: everyone is. Comma-separated in the environment."""
+    """Accepted bearer tokens, comma-separated in the environment; not set: every caller is accepted."""
 
     max_agents: int = Field(default=512, ge=1)
-    """Agents of a request."""
+    """Max number of agents of a request."""
     max_states: int = Field(default=512, ge=1)
-    """Observations of an agent."""
+    """Max number of observations of an agent."""
     max_raster_pixels: int = Field(default=4096 * 4096, ge=1)
-    """Rows × columns of a scene raster."""
+    """Max rows × columns of a scene raster."""
     max_request_bytes: int = Field(default=16 * 2**20, ge=1024)
-    """Size of a request, encoded."""
+    """Max size of an encoded request."""
     max_samples: int = Field(default=2000, ge=1)
-    """Samples of an agent."""
+    """Max number of samples of an agent."""
     max_samples_per_call: int = Field(default=100_000, ge=1)
-    """Samples of all agents of a request."""
+    """Max number of samples of all agents of a request."""
 
     max_batch_agents: int = Field(default=256, ge=1)
-    """Agents in one forward."""
+    """Max number of agents in one forward."""
     max_queue_agents: int = Field(default=2048, ge=1)
-    """Agents accepted but not yet in the model; beyond it calls are refused as overload."""
+    """Max number of agents accepted but not yet in the model; beyond it calls are refused as overload."""
     max_timeout: float = Field(default=30.0, gt=0)
-    """s that a call may take, whatever deadline it brings."""
+    """Max duration of a call in seconds, whatever its own deadline. A forward that takes longer makes the
+    server not ready."""
     drain_seconds: float = Field(default=10.0, ge=0)
-    """s that accepted calls are given when the server stops."""
+    """Seconds that accepted calls get to finish when the server stops."""
     threads: int | None = Field(default=None, ge=1)
-    """Threads of the forward; None: the physical cores."""
+    """Number of threads of the forward; None: the physical cores."""
 
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     """Least severe level that is logged."""
@@ -105,11 +106,11 @@ class Settings(BaseSettings):
     @classmethod
     def _split_tokens(cls, value: object) -> object:
         if isinstance(value, str):
-            # A comma at the end is no token. Nothing but commas is none at all, which would let everyone
-            # in where someone meant to let in a few: an empty secret, say.
+            # A trailing comma is no token. Commas alone name no token, for example an empty secret: without
+            # the error below every caller would be accepted where only a few were meant to be.
             tokens = tuple(token.strip() for token in value.split(",") if token.strip())
             if not tokens:
-                raise ValueError("is set but names no token; leave it out to let everyone in")
+                raise ValueError("is set but names no token; leave it out to accept every caller")
             return tokens
         if isinstance(value, Sequence):
             return tuple(_strip_token(token) for token in value)
@@ -123,7 +124,9 @@ class Settings(BaseSettings):
     @model_validator(mode="after")
     def _queue_takes_a_call(self) -> Self:
         if self.max_queue_agents < self.max_agents:
-            raise ValueError("max_queue_agents must be at least max_agents, or a full request never gets in")
+            raise ValueError(
+                "max_queue_agents must be at least max_agents, or a full request is never accepted"
+            )
         return self
 
     @classmethod
@@ -135,19 +138,19 @@ class Settings(BaseSettings):
         dotenv_settings: PydanticBaseSettingsSource,
         file_secret_settings: PydanticBaseSettingsSource,
     ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """Flags, the environment, the file that ``load`` names; the first that gives a value wins."""
+        """Return the sources by priority: flags, environment, the file that ``load`` names."""
         return init_settings, env_settings, TomlConfigSettingsSource(settings_cls)
 
 
 def load(config: Path | None = None, **flags: Any) -> Settings:
-    """Settings from all sources.
+    """Return the settings from all sources.
 
     Args:
-        config: TOML file; default: the one that ``FORECAST_CONFIG`` names, if it does.
-        flags: what the command line gives; None counts as not given.
+        config: the TOML file; None: the file that ``FORECAST_CONFIG`` names, if any.
+        flags: the values of the command line; None: not given.
 
     Raises:
-        SettingsError: a value is wrong, a variable sets nothing, or the file is not there.
+        SettingsError: a value is invalid, a variable is no setting, or the file does not exist.
     """
     unknown = unknown_variable(os.environ, Settings.model_fields)
     if unknown is not None:
@@ -165,16 +168,16 @@ def load(config: Path | None = None, **flags: Any) -> Settings:
         settings = FromFile(**given)
     except ValidationError as error:
         raise SettingsError("; ".join(_describe(problem) for problem in error.errors())) from None
-    except ValueError as error:  # a file that is no TOML
+    except ValueError as error:  # the file is no valid TOML
         raise SettingsError(f"{file}: {error}") from None
     return settings
 
 
 def _strip_token(token: object) -> object:
-    """A token without the blanks around it.
+    """Return a token without surrounding blanks.
 
     Raises:
-        ValueError: nothing else is left.
+        ValueError: the token is empty.
     """
     if isinstance(token, SecretStr):
         token = token.get_secret_value()
@@ -192,10 +195,10 @@ def _describe(problem: ErrorDetails) -> str:
 
 
 def split_address(address: str) -> tuple[str, int]:
-    """Host and port of HOST:PORT or [IPV6]:PORT.
+    """Return host and port of HOST:PORT or [IPV6]:PORT.
 
     Raises:
-        ValueError: it is neither.
+        ValueError: the address has another form.
     """
     host, colon, port = address.rpartition(":")
     if not colon or not host or not port.isdecimal() or int(port) > 65535:
@@ -204,8 +207,8 @@ def split_address(address: str) -> tuple[str, int]:
 
 
 def bundled_models() -> Path | None:
-    """Folder of the checkpoints that come with the package; None when there are none."""
-    import model  # noqa: PLC0415 - for its place alone
+    """Return the folder of the checkpoints in the package; None if there are none."""
+    import model  # noqa: PLC0415 - only for its path
 
     folder = Path(next(iter(model.__path__))) / "checkpoints"
     return folder if folder.is_dir() else None

@@ -1,4 +1,4 @@
-"""A forecaster that does what a test wants."""
+"""Forecaster that a test controls."""
 
 import threading
 
@@ -14,7 +14,7 @@ from model.scenes.scene import AgentType, Scene
 
 
 class FakeForecaster(Forecaster):
-    """Agents go straight on, each mode a little faster than the one before; heavier modes come later."""
+    """Forecaster of straight motion: each mode is a little faster and heavier than the one before."""
 
     def __init__(
         self,
@@ -51,16 +51,16 @@ class FakeForecaster(Forecaster):
         self.needs_heading = needs_heading
         self.map_types = map_types
         self.free = threading.Event()
-        """Cleared: forwards wait."""
+        """Event that forwards wait for."""
         self.free.set()
         self.entered = threading.Event()
-        """Set when a forward begins."""
+        """Event that is set when a forward begins."""
         self.batches: list[tuple[AgentType, int, Context, int]] = []
         """Type, agents, context and steps of each forward."""
         self.scenes: list[Scene] = []
         self.broken = False
         self.nan_beyond = np.inf
-        """m; agents at a greater x get NaN."""
+        """Position x in m beyond which forecasts are NaN."""
 
     def requires_heading(self, agent_type: AgentType) -> bool:
         return self.needs_heading
@@ -100,12 +100,12 @@ class FakeForecaster(Forecaster):
         )
 
     def forget(self) -> None:
-        """Forgets warm-up."""
+        """Forget the forwards of the warm-up."""
         self.batches.clear()
         self.scenes.clear()
         self.entered.clear()
 
 
 def registry(*forecasters: Forecaster) -> Registry:
-    """The baselines and some more."""
+    """Return a registry of the baselines and some more forecasters."""
     return Registry([*physics.baselines(), kalman.Kalman(), *forecasters])

@@ -44,15 +44,15 @@ RESET = pb.ResetSceneResponse(agents=7)
 
 
 class FakePlane(ConsistencyService):
-    """Answers as it is told to; watches give what is sent to them, from any thread."""
+    """Consistency service with fixed responses; streams yield what is sent to them, from any thread."""
 
     def __init__(self) -> None:  # the real one's needs are none of the transports' business
         self.asked: list[Message] = []
-        """Every request."""
+        """All requests."""
         self.error: Exception | None = None
-        """Ends every call."""
+        """Error that ends every call; None: calls succeed."""
         self.silent = False
-        """Watches do not say that they have begun."""
+        """Flag for streams without a first, empty event."""
         self.watching = 0
         self._queues: list[asyncio.Queue[pb.WatchSceneResponse | Exception | None]] = []
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -97,14 +97,14 @@ class FakePlane(ConsistencyService):
         self.send(None)
 
     def send(self, event: pb.WatchSceneResponse | Exception | None) -> None:
-        """An event to all that watch, an error that ends them, or their end."""
+        """Send all streams an event, an error that ends them, or None, their end."""
         with self._lock:
             for queue in self._queues:
                 assert self._loop is not None
                 self._loop.call_soon_threadsafe(queue.put_nowait, event)
 
     def wait(self, watching: int) -> None:
-        """Returns when so many watch."""
+        """Wait until ``watching`` streams are open."""
         end = time.monotonic() + 10
         while self.watching != watching:
             assert time.monotonic() < end, f"{self.watching} watch"
@@ -117,7 +117,7 @@ class FakePlane(ConsistencyService):
 
 
 def with_fake_plane(server: Server) -> FakePlane:
-    """Puts a fake in the place of the server's own plane."""
+    """Replace the server's consistency service by a fake."""
     plane = FakePlane()
     server.dataplane.consistency = plane
     return plane

@@ -1,4 +1,4 @@
-"""Requests to send."""
+"""Builders of requests."""
 
 import io
 
@@ -25,7 +25,7 @@ def add_agent(
     speed: float = 5.0,
     frames: int = 6,
 ) -> pb.Agent:
-    """An agent that drives along x and is at (x, y) now."""
+    """Add an agent that drives along x and is at (x, y) now."""
     agent = request.agents.add(id=agent_id, type=kind)
     for age in range(frames - 1, -1, -1):
         agent.states.add(time=request.time - 0.5 * age, x=x - 0.5 * age * speed, y=y, heading=0.0)
@@ -33,7 +33,7 @@ def add_agent(
 
 
 def make_request(agents: int = 1, model: str = "", **options: object) -> pb.PredictRequest:
-    """A request with so many vehicles, named a0, a1, …, side by side."""
+    """Return a request with vehicles a0, a1, … side by side."""
     request = pb.PredictRequest(time=NOW, model=model, options=pb.PredictOptions(**options))  # type: ignore[arg-type]
     for index in range(agents):
         add_agent(request, f"a{index}", y=4.0 * index)
@@ -41,12 +41,12 @@ def make_request(agents: int = 1, model: str = "", **options: object) -> pb.Pred
 
 
 def pack(layers: Bytes) -> bytes:
-    """[3, rows, columns] as packed bits."""
+    """Return layers [3, rows, columns] as packed bits."""
     return np.packbits(layers.reshape(-1)).tobytes()
 
 
 def png(layers: Bytes, mode: str = "RGB", kind: str = "PNG") -> bytes:
-    """[3, rows, columns] as a picture."""
+    """Return layers [3, rows, columns] as an image file."""
     buffer = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(layers.transpose(1, 2, 0) * np.uint8(255))).convert(mode).save(
         buffer, kind

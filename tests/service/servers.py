@@ -1,4 +1,4 @@
-"""Real servers on free ports, and ways to call them."""
+"""Servers on free ports, and ways to call them."""
 
 import asyncio
 import threading
@@ -23,14 +23,14 @@ GET_AGENT = "/cab.forecast.v1.ConsistencyService/GetAgentConsistency"
 
 
 def settings(**values: Any) -> Settings:
-    """Settings on free ports, with a short warm-up."""
+    """Return settings with free ports and a short warm-up."""
     free: dict[str, Any] = {"http": "127.0.0.1:0", "grpc": "127.0.0.1:0", "max_batch_agents": 64}
     return Settings(**(free | values))
 
 
 @asynccontextmanager
 async def running(*forecasters: Forecaster, **values: Any) -> AsyncIterator[Server]:
-    """A server with the baselines and those forecasters, the first of which is the default."""
+    """Run a server with the baselines and the forecasters, the first of which is the default."""
     default = {"default_model": forecasters[0].info.name} if forecasters else {}
     server = Server(settings(**(default | values)), load=lambda: registry(*forecasters))
     await server.start()
@@ -45,7 +45,7 @@ async def running(*forecasters: Forecaster, **values: Any) -> AsyncIterator[Serv
 
 @contextmanager
 def in_thread(with_settings: Settings) -> Iterator[Server]:
-    """A server in a loop and thread of its own, for clients that block."""
+    """Run a server in a loop and thread of its own, for blocking clients."""
     loop = asyncio.new_event_loop()
     thread = threading.Thread(target=loop.run_forever)
     thread.start()
@@ -68,18 +68,18 @@ def in_thread(with_settings: Settings) -> Iterator[Server]:
 
 
 async def until_waiting(server: Server, agents: int) -> None:
-    """Returns when so many agents are queued."""
+    """Wait until ``agents`` agents are queued."""
     await until(lambda: server.metrics.registry.get_sample_value("forecast_queue_agents") == agents)
 
 
 def count(server: Server, transport: str, method: str, code: str) -> float:
-    """How many calls ended so."""
+    """Return the number of calls with that code."""
     labels = {"transport": transport, "method": method, "code": code}
     return server.metrics.registry.get_sample_value("forecast_requests_total", labels) or 0.0
 
 
 async def until(condition: Callable[[], object]) -> None:
-    """Returns when it holds."""
+    """Wait until the condition holds."""
     async with asyncio.timeout(10):
         while not condition():  # noqa: ASYNC110 - no event tells
             await asyncio.sleep(0.005)
@@ -87,7 +87,7 @@ async def until(condition: Callable[[], object]) -> None:
 
 @dataclass
 class CallError(Exception):
-    """An error as a client sees it, on any transport."""
+    """Error as a client sees it, on any transport."""
 
     code: str
     message: str
@@ -103,7 +103,7 @@ async def call_grpc(
     metadata: Mapping[str, str] | None = None,
     timeout: float | None = 20,  # noqa: ASYNC109 - it travels
 ) -> pb.PredictResponse:
-    """Predict over gRPC."""
+    """Call Predict over gRPC."""
     body = request if isinstance(request, bytes) else request.SerializeToString()
     return pb.PredictResponse.FromString(await _invoke(server, PREDICT, body, metadata, timeout))
 
@@ -113,7 +113,7 @@ async def get_agent_grpc(
     request: consistency_pb.GetAgentConsistencyRequest,
     metadata: Mapping[str, str] | None = None,
 ) -> consistency_pb.GetAgentConsistencyResponse:
-    """GetAgentConsistency over gRPC."""
+    """Call GetAgentConsistency over gRPC."""
     answer = await _invoke(server, GET_AGENT, request.SerializeToString(), metadata, 20)
     return consistency_pb.GetAgentConsistencyResponse.FromString(answer)
 
@@ -142,7 +142,7 @@ async def call_rest(
     metadata: Mapping[str, str] | None = None,
     timeout: float | None = None,  # noqa: ASYNC109 - it travels
 ) -> pb.PredictResponse:
-    """Predict over REST, with protobuf bodies."""
+    """Call Predict over REST, with protobuf bodies."""
     headers = {"content-type": "application/x-protobuf"} | dict(metadata or {})
     if timeout is not None:
         headers["Request-Timeout"] = str(timeout)
@@ -161,7 +161,7 @@ async def get_agent_rest(
     request: consistency_pb.GetAgentConsistencyRequest,
     metadata: Mapping[str, str] | None = None,
 ) -> consistency_pb.GetAgentConsistencyResponse:
-    """GetAgentConsistency over REST."""
+    """Call GetAgentConsistency over REST."""
     async with httpx.AsyncClient(timeout=20) as client:
         response = await client.get(
             f"http://{server.http_address}/v1/consistency/agent",
@@ -178,7 +178,7 @@ GET_AGENT_BY = {"grpc": get_agent_grpc, "rest": get_agent_rest}
 
 
 def from_problem(response: httpx.Response) -> CallError:
-    """The error in a problem+json answer."""
+    """Return the error of a problem+json response."""
     assert response.headers["content-type"] == "application/problem+json", response.text
     problem = response.json()
     assert problem["status"] == response.status_code
@@ -194,7 +194,7 @@ def from_problem(response: httpx.Response) -> CallError:
 
 
 def from_grpc(error: grpc.aio.AioRpcError) -> CallError:
-    """The error in the status and details of a gRPC call."""
+    """Return the error in the status and details of a gRPC call."""
     failed = CallError(error.code().name, error.details() or "", "")
     trailing: Any = error.trailing_metadata() or ()
     for key, value in trailing:
