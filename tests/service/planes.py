@@ -1,4 +1,4 @@
-"""A plane of consistency that says what a test wants."""
+"""Consistency service that a test controls."""
 
 import asyncio
 import threading
