@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from structlog.testing import capture_logs
 
 from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
-from cab_forecast import AsyncClient, BadRequest, Overloaded, TrackingUnavailable, UnknownTrack
+from cab_forecast import AsyncClient, BadRequest, ForecastError, Overloaded, TrackingUnavailable, UnknownTrack
 from loadtest.redis_servers import free_port, single
 from service.server import Server
 from service.tracking.store.factory import MAX_WATCHERS
@@ -290,6 +291,30 @@ async def test_no_more_than_so_many_watch(server: Server) -> None:
         with pytest.raises(Overloaded, match=f"{MAX_WATCHERS} calls watch already"):
             async with client.watch_scene(scene_name()):
                 pass
+
+
+async def test_a_bug_while_watching_is_internal_and_in_the_log(
+    redis_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def fail(*_: object, **__: object) -> None:
+        raise TypeError("a secret")
+
+    async with running(store=redis_url, default_model=MODEL, **PATIENT) as server:
+        for address in (f"grpc://{server.grpc_address}", f"http://{server.http_address}"):
+            async with AsyncClient(address, timeout=30.0, retries=0) as client:
+                with capture_logs() as logs, monkeypatch.context() as patch:
+                    patch.setattr("redis.asyncio.Redis.xread", fail)
+                    with pytest.raises(ForecastError) as raised:
+                        async with client.watch_scene(scene_name()) as events:
+                            await anext(events)
+                assert raised.value.code == "INTERNAL"
+                assert "secret" not in str(raised.value)
+                (logged,) = [one for one in logs if one["log_level"] == "error"]
+                assert isinstance(logged["exc_info"], TypeError)
+        errors = [
+            line for line in server.metrics.render().decode().splitlines() if "store_errors_total{" in line
+        ]
+        assert errors == []
 
 
 async def test_an_agent_that_nothing_was_forecast_for(server: Server) -> None:

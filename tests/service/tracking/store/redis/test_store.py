@@ -7,10 +7,10 @@ from collections.abc import AsyncIterator, Sequence
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from redis.exceptions import OutOfMemoryError
+from redis import exceptions as redis_errors
 
 from loadtest.redis_servers import Process, single
-from service.tracking.store.base import ExchangeResult, SceneStatus, TrackStatus, TrackStore
+from service.tracking.store.base import ExchangeResult, SceneStatus, StoreError, TrackStatus, TrackStore
 from service.tracking.store.records import NEWLY, unpack_instants
 from service.tracking.store.redis.scripts import SceneKeys
 from service.tracking.store.redis.store import MAX_ENTRIES, RedisStore
@@ -240,7 +240,7 @@ async def test_a_full_redis_says_so_and_recovers() -> None:
             scene = scene_name()
             answers = await replay([store], scene, times(6))
             server.command("config", "set", "maxmemory", "1")
-            with pytest.raises(OutOfMemoryError):
+            with pytest.raises(redis_errors.OutOfMemoryError):
                 await replay([store], scene, times(7)[6:])
             server.command("config", "set", "maxmemory", "0")
             answers += await replay([store], scene, times(14)[6:])
@@ -360,3 +360,81 @@ async def test_a_cancelled_call_leaves_no_trouble(store: RedisStore) -> None:
         assert all(isinstance(one, ExchangeResult) for one in (done[0], done[2]))
     settled = rows(answers)
     assert len(settled) == len(set(settled)) == 28
+
+
+class FakeWatchClient:
+    """A client whose reads fail."""
+
+    def __init__(self, error: Exception) -> None:
+        self.error = error
+
+    async def xrevrange(self, *_: object, **__: object) -> list[object]:
+        return []
+
+    async def set(self, *_: object, **__: object) -> None:
+        pass
+
+    async def xread(self, *_: object, **__: object) -> None:
+        raise self.error
+
+    async def aclose(self) -> None:
+        pass
+
+
+async def next_of_a_watch(error: Exception) -> object:
+    """What a watch raises after its beginning, if reading raises this."""
+    client = FakeWatchClient(error)
+    source = RedisStore(client, client, 30.0, 100).watch("scene")
+    assert await anext(source) == ((), 0)
+    return await anext(source)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        redis_errors.ConnectionError("gone"),
+        redis_errors.TimeoutError(),
+        redis_errors.ResponseError("WRONGTYPE"),
+        redis_errors.RedisClusterException(),
+        ConnectionResetError(),
+        TimeoutError(),
+    ],
+)
+async def test_failures_of_redis_end_a_watch_as_such(error: Exception) -> None:
+    with pytest.raises(StoreError) as raised:
+        await next_of_a_watch(error)
+    assert raised.value.__cause__ is error
+
+
+@pytest.mark.parametrize(
+    "error", [TypeError("bug"), AttributeError("bug"), KeyError("bug"), ValueError("bug")]
+)
+async def test_a_bug_in_a_watch_is_no_failure_of_redis(error: Exception) -> None:
+    with pytest.raises(type(error)) as raised:
+        await next_of_a_watch(error)
+    assert raised.value is error
+
+
+@pytest.mark.parametrize(("error", "told"), [(TypeError("bug"), TypeError), (ConnectionError(), None)])
+async def test_the_renewal_of_a_watch_hides_no_bug(
+    store: RedisStore, monkeypatch: pytest.MonkeyPatch, error: Exception, told: type[Exception] | None
+) -> None:
+    monkeypatch.setattr("service.tracking.store.redis.store._WATCHED_MS", 100)
+    monkeypatch.setattr("service.tracking.store.redis.store._BLOCK_MS", 50)
+    scene = scene_name()
+    source = store.watch(scene)
+    async with asyncio.timeout(20):
+        await anext(source)
+
+        async def fail(*_: object, **__: object) -> None:
+            raise error
+
+        monkeypatch.setattr(store._watch_client, "set", fail)
+        await asyncio.sleep(0.1)
+        if told is None:
+            await store.publish(scene, [b"event"])
+            assert await anext(source) == ([b"event"], 0)
+        else:
+            with pytest.raises(told):
+                await anext(source)
+    await source.aclose()
