@@ -1,4 +1,4 @@
-"""Import of weights that others published."""
+"""Import of published weights of other projects."""
 
 from model.convert.errors import ConversionError, UnsafePickleError
 from model.convert.trajectron import convert_trajectron

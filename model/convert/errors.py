@@ -1,9 +1,9 @@
-"""What can be wrong with weights that are to be imported."""
+"""Errors of the import of weights."""
 
 
 class ConversionError(ValueError):
-    """The source is not what this package can import; the message says why."""
+    """A source that this package cannot import; the message says why."""
 
 
 class UnsafePickleError(ConversionError):
-    """A pickle names, calls or encodes something that is not known to be harmless. Nothing of it was run."""
+    """A pickle that names, calls or encodes anything not known to be harmless. None of it was executed."""

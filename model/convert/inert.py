@@ -1,4 +1,4 @@
-"""What stands for torch's objects in a pickle: plain values that can do nothing."""
+"""Inert stand-ins for torch's objects in a pickle: plain values without behaviour."""
 
 from collections.abc import Mapping
 from enum import Enum, auto
@@ -7,18 +7,18 @@ from typing import NamedTuple, TypeAlias, TypeGuard
 from model.convert.errors import ConversionError, UnsafePickleError
 
 MAX_NAME_LENGTH = 128
-"""Characters of an attribute, module, parameter or storage key."""
+"""Maximum number of characters of an attribute, module, parameter or storage key."""
 
 
 class StorageRef(NamedTuple):
-    """Where a tensor's numbers lie: in the storage of that key, which follows the pickle."""
+    """A reference to the storage of a tensor's numbers, which follows the pickle."""
 
     key: str
     length: int
 
 
 class TensorRef(NamedTuple):
-    """A tensor as the pickle describes it; whether the storage is there and large enough is not known."""
+    """A tensor as the pickle describes it; its storage is not yet known to exist and to be large enough."""
 
     storage: StorageRef
     offset: int
@@ -27,7 +27,7 @@ class TensorRef(NamedTuple):
 
 
 class InertModule:
-    """Stands for any ``nn.Module``: keeps its state, does nothing."""
+    """A stand-in for any ``nn.Module``, which only holds its state."""
 
     __slots__ = ("state",)
 
@@ -36,7 +36,7 @@ class InertModule:
 
 
 class Named(Enum):
-    """What a checkpoint names besides its modules; no member can be called or changed."""
+    """The names in a checkpoint besides its modules; members can be neither called nor changed."""
 
     ORDERED_DICT = auto()
     FLOAT_STORAGE = auto()
@@ -64,20 +64,20 @@ TORCH_MODULES: Mapping[str, Meaning] = {
     "torch._utils _rebuild_tensor_v2": Named.REBUILD_TENSOR,
     **dict.fromkeys(_MODULE_CLASSES, InertModule),
 }
-"""What a Trajectron++ checkpoint names, and what each name stands for here."""
+"""The names in a Trajectron++ checkpoint, and their stand-ins."""
 
 
 def is_name(value: object) -> TypeGuard[str]:
-    """Whether this is a string that may be a key, and told in a message: short and printable."""
+    """Return whether this is a string that may be a key and appear in a message: short and printable."""
     return type(value) is str and len(value) <= MAX_NAME_LENGTH and value.isprintable()
 
 
 def build(function: object, arguments: tuple[object, ...]) -> dict[str, object] | TensorRef:
-    """What one of torch's builders gives: an empty dictionary, or a tensor.
+    """Return the result of one of torch's builders: an empty dictionary, or a tensor.
 
     Raises:
-        UnsafePickleError: it is none of these builders.
-        ConversionError: it is one, with arguments that torch does not write.
+        UnsafePickleError: the function is none of these builders.
+        ConversionError: the arguments are none that torch writes.
     """
     if function is Named.ORDERED_DICT and not arguments:
         return {}
@@ -105,10 +105,10 @@ def _parameter(arguments: tuple[object, ...]) -> TensorRef:
 
 
 def refer(pid: object) -> type[InertModule] | StorageRef:
-    """Torch's two kinds of outside objects: classes with their source code, and storages.
+    """Resolve a persistent id: a class with its source code, or a storage.
 
     Raises:
-        ConversionError: it is neither.
+        ConversionError: the id is neither.
     """
     match pid:
         case ("module", cls, str(), str()) if cls is InertModule:

@@ -1,4 +1,4 @@
-"""The opcodes of a pickle: read, counted and looked through before any of them takes effect."""
+"""The opcodes of a pickle, which are counted and checked before any of them takes effect."""
 
 import io
 import pickletools
@@ -8,18 +8,18 @@ from typing import Any, NamedTuple
 from model.convert.errors import ConversionError, UnsafePickleError
 
 MAX_PICKLE_BYTES = 1 << 24
-"""Of one pickle (the module tree of Trajectron++ takes 59 kB)."""
+"""Maximum size of one pickle (the module tree of Trajectron++: 59 kB)."""
 MAX_OPCODES = 1 << 17
-"""Of one pickle (Trajectron++: 8199). Nothing that a pickle builds is larger than what its opcodes name."""
+"""Maximum number of opcodes of one pickle (Trajectron++: 8199), which bounds the size of what it builds."""
 MAX_MEMO = MAX_OPCODES
-"""Largest index into a pickle's memo."""
+"""Maximum index into a pickle's memo."""
 
 _TOLD_CHARACTERS = 200
-"""Of what a file says about itself in an error's message."""
+"""Maximum number of characters from a file in an error message."""
 
 
 class Opcode(NamedTuple):
-    """One instruction: its name in ``pickletools``, its decoded argument, its byte in the file."""
+    """One instruction: its name in ``pickletools``, its decoded argument, its position in the file."""
 
     name: str
     argument: Any
@@ -27,10 +27,10 @@ class Opcode(NamedTuple):
 
 
 def read_opcodes(stream: io.BytesIO) -> Sequence[Opcode]:
-    """The next pickle of a stream, which is left at the pickle's end.
+    """Read the opcodes of the next pickle of a stream, up to the pickle's end.
 
     Raises:
-        ConversionError: it is no whole pickle, or larger than ``MAX_PICKLE_BYTES`` or ``MAX_OPCODES``.
+        ConversionError: the pickle is incomplete, or larger than ``MAX_PICKLE_BYTES`` or ``MAX_OPCODES``.
     """
     start = stream.tell()
     window = io.BytesIO(stream.getbuffer()[start : start + MAX_PICKLE_BYTES])
@@ -42,7 +42,7 @@ def read_opcodes(stream: io.BytesIO) -> Sequence[Opcode]:
             opcodes.append(Opcode(opcode.name, argument, start + (position or 0)))
     except ConversionError:
         raise
-    except Exception as error:  # a damaged pickle can raise nearly anything
+    except Exception as error:  # pickletools raises many types for damaged pickles
         told = f"{error}"[:_TOLD_CHARACTERS]
         raise ConversionError(
             f"no whole pickle in the {MAX_PICKLE_BYTES} bytes at byte {start}: {told}"
@@ -52,18 +52,18 @@ def read_opcodes(stream: io.BytesIO) -> Sequence[Opcode]:
 
 
 def check_opcodes(opcodes: Iterable[Opcode], known: Container[str], names: Container[str]) -> None:
-    """Refuses a pickle for what it says, whether or not it would ever come to that.
+    """Refuse a pickle with a foreign name or opcode, even one that would never be reached.
 
-    A foreign name is told rather than a foreign opcode before it, as it says more about the file.
+    A foreign name is reported in preference to an earlier foreign opcode, as it says more about the file.
 
     Args:
-        opcodes: the whole pickle.
-        known: the opcodes that it may use.
-        names: what it may name, as "module name".
+        opcodes: all opcodes of the pickle.
+        known: names of allowed opcodes.
+        names: names that the pickle may use, as "module name".
 
     Raises:
-        UnsafePickleError: it names anything else, or uses any other opcode.
-        ConversionError: its memo is too large.
+        UnsafePickleError: the pickle uses any other name or opcode.
+        ConversionError: the memo of the pickle is too large.
     """
     foreign: Opcode | None = None
     texts = ["", ""]
@@ -76,7 +76,7 @@ def check_opcodes(opcodes: Iterable[Opcode], known: Container[str], names: Conta
             if named not in names:
                 told = ascii(named[:_TOLD_CHARACTERS])[1:-1].replace(" ", ".")
                 raise UnsafePickleError(f"the pickle names {told}, which is not allowed ({at(opcode)})")
-        elif name.startswith("EXT"):  # code numbers stand for names of the process's own registry
+        elif name.startswith("EXT"):  # codes stand for names in the registry of the process
             raise UnsafePickleError(f"the pickle names extension code {argument} ({at(opcode)})")
         elif name.endswith("PUT") and argument > MAX_MEMO:
             raise ConversionError(f"the pickle wants a memo of {argument} entries ({at(opcode)})")
@@ -87,5 +87,5 @@ def check_opcodes(opcodes: Iterable[Opcode], known: Container[str], names: Conta
 
 
 def at(opcode: Opcode) -> str:
-    """Which opcode it is, for an error's message."""
+    """Describe an opcode in an error message."""
     return f"{opcode.name} at byte {opcode.position}"

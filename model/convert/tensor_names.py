@@ -1,4 +1,4 @@
-"""Names of the released code's tensors, and ours.
+"""The translation of tensor names from the released code's to ours.
 
 Released: ``VEHICLE/decoder/initial_h.weight`` (Trajectron++ and its descendants; ``so/`` and ``state_branch``
 are the blind branch of Reweight and RUBiZ). Ours: ``vehicle.full.decoder.initial_h.weight``.
@@ -19,7 +19,7 @@ _RENAMED = {
     "node_future_encoder": "future_encoder.lstm",
     "node_future_encoder/initial_h": "future_encoder.initial_h",
     "node_future_encoder/initial_c": "future_encoder.initial_c",
-    # Both branches' logits of p(z | x): the released blind branch has some of its own, but leaves them unused
+    # Logits of p(z | x) of both branches: the released blind branch has its own, but does not use them
     "hx_to_z": "prior_logits",
     "unicycle_initializer": "full.heading_correction",
     "None/unicycle_initializer": "full.heading_correction",
@@ -38,11 +38,11 @@ _BRANCH = {
     "decoder/proj_to_GMM_log_sigmas": "decoder.log_sigma",
     "decoder/proj_to_GMM_corrs": "decoder.correlation",
 }
-"""Modules of a branch: of the full one as they are, of the blind one behind ``so/``."""
+"""Modules of a branch; those of the blind one have the prefix ``so/``."""
 
 _UNUSED = frozenset(
     {
-        "decoder/proj_to_GMM_log_pis",  # of a control mixture of one component
+        "decoder/proj_to_GMM_log_pis",  # weights of a mixture of one component
         "so/decoder/proj_to_GMM_log_pis",
         "so/hx_to_z",
         "decoder/rubi/proj_to_sigmas",
@@ -60,17 +60,17 @@ _MODULES = {
 _NODE_TYPES = {"VEHICLE": "vehicle", "PEDESTRIAN": "pedestrian"}
 _EDGE = re.compile(r"(\w+)->(\w+)/edge_encoder")
 _SINGLE_LAYER = ("history_encoder", "neighbor_encoder.edges")
-"""Our LSTMs of these have one layer, one direction, and so no suffix for it."""
+"""Our LSTMs of one layer and one direction, whose parameters have no suffix for the layer."""
 
 
 def rename(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Tensors of the released code under the names of ours; unused ones are left out.
+    """Rename tensors of the released code to our names, leaving out unused ones.
 
     Args:
-        tensors: by the released code's names.
+        tensors: tensors by the released code's names.
 
     Raises:
-        ConversionError: a name is not known, or two mean the same tensor.
+        ConversionError: a name is unknown, or two names mean the same tensor.
     """
     renamed: dict[str, Tensor] = {}
     for name, tensor in tensors.items():
@@ -84,7 +84,7 @@ def rename(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def our_name(name: str) -> str | None:
-    """Ours for theirs; None for what is unused."""
+    """Return our name for a tensor of the released code; None for an unused one."""
     module, _, parameter = name.rpartition(".")
     if edge := _EDGE.fullmatch(module):
         node, neighbor = (_node_type(name, end) for end in edge.groups())
@@ -108,7 +108,7 @@ def _node_type(name: str, theirs: str) -> str:
 
 
 def _lookup(name: str, module: str) -> str:
-    """Ours for the longest known beginning of a module's name, with what follows it."""
+    """Return our name of a module: that of its longest known prefix, followed by the rest."""
     known, rest = module, ""
     while known not in _MODULES:
         known, dot, last = known.rpartition(".")

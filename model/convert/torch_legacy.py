@@ -1,6 +1,6 @@
-"""Torch's file format of before version 1.6, read into numpy arrays.
+"""The file format of torch before version 1.6, read into numpy arrays.
 
-Five pickles, one behind the other (magic number, format version, facts on the writing machine, the object,
+A file consists of five pickles (magic number, format version, facts about the writing machine, the object,
 the keys of its storages), then each storage: its length as int64, and its raw little-endian numbers
 (``torch/serialization.py``, ``_legacy_save``).
 """
@@ -17,13 +17,13 @@ from model.convert.inert import TORCH_MODULES, InertModule, TensorRef, is_name
 from model.convert.unpickling import unpickle
 
 MAX_FILE_BYTES = 1 << 29
-"""Larger files are refused (Trajectron++ takes 1.3 MB)."""
+"""Maximum size of a file (Trajectron++: 1.3 MB)."""
 MAX_DEPTH = 16
-"""Modules within modules."""
+"""Maximum depth of nested modules."""
 MAX_MODULES = 10_000
-"""In a tree (Trajectron++: 51)."""
+"""Maximum number of modules in a tree (Trajectron++: 51)."""
 MAX_PARAMETERS = 10_000
-"""In a tree, those that are None included (Trajectron++: 110)."""
+"""Maximum number of parameters in a tree, including None (Trajectron++: 110)."""
 
 _MAGIC = 0x1950A86A20F9469CFC6C
 _FORMAT_VERSION = 1001
@@ -31,17 +31,17 @@ _ZIP_MAGIC = b"PK\x03\x04"
 
 
 def read_parameters(file: Path) -> dict[str, Float32s]:
-    """The parameters of a pickled module tree.
+    """Read the parameters of a pickled module tree.
 
     Args:
-        file: of torch's legacy format, holding one nn.Module.
+        file: a file in torch's legacy format that holds one nn.Module.
 
     Returns:
-        Arrays by name, as ``state_dict`` would name them.
+        Arrays by the names that ``state_dict`` would give them.
 
     Raises:
-        UnsafePickleError: it names or does something that is not known to be harmless; nothing was run.
-        ConversionError: it is not such a file, or damaged.
+        UnsafePickleError: the file names or does anything not known to be harmless; nothing was executed.
+        ConversionError: the file is damaged or of another format.
     """
     try:
         return _parameters(_load(file))
@@ -56,7 +56,7 @@ def _load(file: Path) -> io.BytesIO:
     if size > MAX_FILE_BYTES:
         raise ConversionError(f"{size} bytes are too many; at most {MAX_FILE_BYTES} are read")
     with file.open("rb") as handle:
-        data = handle.read(size)  # and no more, whatever has happened to the file
+        data = handle.read(size)  # and no more, even if the file has grown
     if data.startswith(_ZIP_MAGIC):
         raise ConversionError(
             "this is a zip archive, the format of torch since 1.6; only legacy files are read "
@@ -81,14 +81,14 @@ def _parameters(stream: io.BytesIO) -> dict[str, Float32s]:
     for name, reference in references.items():
         array = _tensor(name, reference, storages)
         budget -= array.size
-        if budget < 0:  # else a small file could ask for as much memory as it likes
+        if budget < 0:  # or a small file could demand unlimited memory
             raise ConversionError("the parameters overlap in their storages")
         parameters[name] = array.copy()
     return parameters
 
 
 def _storages(stream: io.BytesIO) -> Mapping[str, Float32s]:
-    """The storages behind the object, by key."""
+    """Read the storages that follow the object, by key."""
     keys = unpickle(stream, {})
     if not isinstance(keys, list) or not all(map(is_name, keys)):
         raise ConversionError("the list of storages is damaged")
@@ -108,7 +108,7 @@ def _storages(stream: io.BytesIO) -> Mapping[str, Float32s]:
 
 
 def _walk(root: object) -> Iterator[tuple[str, object]]:
-    """Names and tensor references of all parameters of a module tree, in its order."""
+    """Yield names and tensor references of all parameters of a module tree, in its order."""
     pending: list[tuple[tuple[str, ...], object]] = [((), root)]
     modules: set[InertModule] = set()
     parameters = 0
@@ -116,7 +116,7 @@ def _walk(root: object) -> Iterator[tuple[str, object]]:
         path, module = pending.pop()
         if not isinstance(module, InertModule):
             raise ConversionError(f"{_told(path)} is not a module")
-        if module in modules:  # a small file could name it as often as it likes
+        if module in modules:  # or a small file could name it any number of times
             raise ConversionError(f"the tree of modules is too large, or none: {_told(path)} is in it twice")
         modules.add(module)
         if len(path) > MAX_DEPTH:
@@ -148,7 +148,7 @@ def _told(path: tuple[str, ...]) -> str:
 
 
 def _tensor(name: str, reference: object, storages: Mapping[str, Float32s]) -> Float32s:
-    """A read-only view of a storage; numpy checks that shape and strides stay within it."""
+    """Return a read-only view of a storage; numpy checks that shape and strides stay within it."""
     if not isinstance(reference, TensorRef):
         raise ConversionError(f"{name} is not a tensor")
     (key, count), offset, size, stride = reference

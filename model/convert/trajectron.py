@@ -1,4 +1,7 @@
-"""Published Trajectron++ checkpoints (github.com/StanfordASL/Trajectron-plus-plus, nuScenes), as ours."""
+"""Conversion of published Trajectron++ checkpoints for nuScenes.
+
+They are from github.com/StanfordASL/Trajectron-plus-plus.
+"""
 
 import json
 import shutil
@@ -57,12 +60,12 @@ _REQUIRED: Final[dict[str, Any]] = {
     "pred_state.VEHICLE": {"position": ["x", "y"]},
     "pred_state.PEDESTRIAN": {"position": ["x", "y"]},
 }
-"""Settings, by path within config.json, that our network has built in."""
+"""Settings by path within config.json that are fixed in our network."""
 
 _MISSING: Final = object()
 
 MAX_HISTORY_LENGTH = 64
-"""Frames before now; longer is a mistake."""
+"""Maximum number of frames before now."""
 
 _TYPES = (AgentType.VEHICLE, AgentType.PEDESTRIAN)
 
@@ -83,17 +86,17 @@ interactions, edge encoding and map encoding, converted tensor by tensor; nothin
 
 
 def convert_trajectron(source: Path, checkpoint: int, out: Path) -> None:
-    """Converts a published Trajectron++ checkpoint for nuScenes.
+    """Convert a published Trajectron++ checkpoint for nuScenes.
 
-    Nothing that its pickle names is run.
+    Nothing that its pickle names is executed.
 
     Args:
-        source: folder with config.json and model_registrar-<checkpoint>.pt, and perhaps LICENSE.
+        source: folder with config.json, model_registrar-<checkpoint>.pt and, optionally, LICENSE.
         checkpoint: the epoch.
-        out: folder of the new checkpoint; made where it does not exist.
+        out: folder of the new checkpoint, created if missing.
 
     Raises:
-        UnsafePickleError: the pickle names something that is not known to be harmless.
+        UnsafePickleError: the pickle names anything not known to be harmless.
         ConversionError: a file is missing or damaged, or the network is not one that this package has.
     """
     if out.resolve() == source.resolve():
@@ -133,7 +136,7 @@ def _info(checkpoint: int, frames: int, network: NetworkConfig) -> ModelInfo:
 
 
 def _history_frames(file: Path) -> int:
-    """Checks that the settings describe our network, and gives the frames of history, now included."""
+    """Check that the settings describe our network, and return the frames of history, now included."""
     try:
         settings = json.loads(file.read_text(encoding="utf-8"))
     except OSError as error:
@@ -156,7 +159,7 @@ def _history_frames(file: Path) -> int:
 
 
 def _setting(settings: Any, path: str) -> Any:
-    """The setting at a path of dotted keys; ``_MISSING`` where there is none."""
+    """Return the setting at a path of dotted keys, or ``_MISSING``."""
     for key in path.split("."):
         if not isinstance(settings, dict) or key not in settings:
             return _MISSING

@@ -1,9 +1,9 @@
-"""Pickles of torch modules, read without running anything that they name.
+"""An unpickler for torch modules that executes nothing that a pickle names.
 
-A pickle is a program for a stack machine, and Python's own machine can be made to call anything. This one
-knows only the opcodes that torch's legacy writer uses, and has only plain values to build from: scalars,
-short tuples, lists, dictionaries with strings as keys, stand-ins of modules and tensors. Nothing is copied,
-and nothing but short strings is hashed; so time and memory grow with the number of opcodes, which is limited.
+A pickle is a program for a stack machine, and Python's own machine can call any function. This one knows only
+the opcodes that torch's legacy writer uses, and builds only plain values: scalars, short tuples, lists,
+dictionaries with string keys, and stand-ins of modules and tensors. It copies nothing and hashes only short
+strings, so that time and memory are linear in the number of opcodes, which is limited.
 """
 
 import io
@@ -26,24 +26,24 @@ from model.convert.opcodes import Opcode, at, check_opcodes, read_opcodes
 __all__ = ["TORCH_MODULES", "InertModule", "StorageRef", "TensorRef", "unpickle"]
 
 MAX_MARKS = 256
-"""Groups within groups (Trajectron++: 10)."""
+"""Maximum depth of nested groups (Trajectron++: 10)."""
 MAX_TUPLE_ITEMS = 128
 MAX_INT_BITS = 80
-"""Torch's magic number has 77."""
+"""Maximum size of an integer (torch's magic number: 77 bits)."""
 
 _PROTOCOL = 2
 
 
 def unpickle(stream: io.BytesIO, names: Mapping[str, Meaning]) -> object:
-    """The next pickle of a stream, which is left at the pickle's end.
+    """Read the next pickle of a stream, up to the pickle's end.
 
     Args:
         stream: the whole file.
-        names: what the pickle may name, as "module name", and what each stands for.
+        names: names that the pickle may use, as "module name", and their stand-ins.
 
     Raises:
-        UnsafePickleError: it names anything else, or does anything that torch's writer does not.
-        ConversionError: it is no whole pickle, too large, or not of such objects.
+        UnsafePickleError: the pickle uses any other name, or an opcode that torch does not write.
+        ConversionError: the pickle is incomplete, too large, or of other objects.
     """
     opcodes = read_opcodes(stream)
     check_opcodes(opcodes, _STEPS, names)
@@ -51,6 +51,8 @@ def unpickle(stream: io.BytesIO, names: Mapping[str, Meaning]) -> object:
 
 
 class _Machine:
+    """The stack machine that runs a pickle's opcodes."""
+
     def __init__(self, names: Mapping[str, Meaning]) -> None:
         self._names = names
         self._stack: list[object] = []
@@ -223,4 +225,4 @@ _STEPS: Final[Mapping[str, _Step]] = {
     "REDUCE": _Machine.reduce,
     "BINPERSID": _Machine.refer,
 }
-"""All that a pickle may do, by opcode."""
+"""The allowed opcodes, and the methods that run them."""

@@ -1,15 +1,17 @@
-"""The network that sees and forecasts in the agent's own frame: origin at the agent, x along its heading.
+"""The network of the agent's own frame: origin at the agent, x along its heading.
 
-It keeps the structure of Trajectron++ (Salzmann et al. 2020, section 4): encoders of history, neighbours and
+It has the structure of Trajectron++ (Salzmann et al. 2020, section 4): encoders of history, neighbours and
 map, a categorical latent z, and a decoder that forecasts controls of a unicycle for each category. It differs
-where measurements asked for it; ``docs/experiments.md`` has the figures:
+where experiments favoured it (figures in ``docs/experiments.md``):
 
 - Everything is in the agent's frame, so a scene turned or shifted is forecast turned or shifted.
-- Two map patches: one near and fine, one as far as 6 s reach.
-- All steps of a mode are decoded at once instead of by an unrolled GRU, first as a proposal, and again once
-  map and neighbours have been read where the proposal leads (propose and refine, as Zhou et al. 2023, QCNet).
-- Positions' standard deviations along and across the path are outputs, not propagated from the controls'.
-- p(z | x) is trained as the weights of the mixture itself, so there is no q(z | x, y).
+- There are two map patches: a near, fine one, and a far one that reaches as far as 6 s.
+- All steps of a mode are decoded at once instead of by an unrolled GRU: first as a proposal, then again with
+  the map and the neighbours along the proposal (propose and refine, as in QCNet, Zhou et al. 2023).
+- Standard deviations of positions along and across the path are outputs, not propagated from the controls.
+- p(z | x) is trained as the weights of the mixture itself, without a q(z | x, y).
+
+``AgentFrameNetwork`` comes first; below it stand its parts, in the order in which a forward pass meets them.
 """
 
 import math
@@ -33,105 +35,39 @@ from model.scenes.raster import FAR, PatchGeometry
 from model.scenes.scene import STEP_SECONDS, AgentType
 
 STEPS = 12
-"""T, steps of 0.5 s that are decoded."""
+"""T, number of decoded steps of 0.5 s."""
 _SECONDS = tuple(STEP_SECONDS * step for step in range(1, STEPS + 1))
 _USUAL_LOG_SIGMA = tuple((math.log(0.15 * s**1.5), math.log(0.08 * s**1.3)) for s in _SECONDS)
-"""[T, 2], of standard deviations along and across a path in m, from which the decoder's outputs depart."""
+"""[T, 2], logarithms of standard deviations (m) along and across a path; the decoder adds to them."""
 _WIDTH = 64
-"""Of every encoding."""
+"""Width of every encoding."""
 _HIDDEN = 128
-"""Of a mode."""
+"""Width of a mode's hidden state."""
 _DROPOUT = 0.1
-"""Of the maps' encodings and of the whole encoding."""
+"""Dropout of the maps' encodings and of the joint encoding."""
 _NEAR_M = (20.0, 4.0)
-"""m ahead and to the left, within which a neighbour's place is told finely."""
+"""m ahead and to the left; within it a neighbour's position has a fine encoding."""
 _STEP_WIDTH = 32
-"""Of what is read at one step of a mode."""
+"""Width of the encoding read at one step of a mode."""
 _CONTROL_SCALE = (0.3, 2.0)
-"""rad/s and m/s²: a control of 1 in the decoder's units."""
+"""rad/s and m/s², units of the decoder's controls."""
 _MAX_HEADING_CORRECTION = 0.3
-"""rad; a given heading is noisy, so a path may begin that far beside it."""
+"""rad, maximum correction of the initial heading, since given headings are noisy."""
 _MAX_SPEED_CORRECTION = 2.0
-"""m/s; so is a velocity."""
+"""m/s, maximum correction of the initial speed, likewise."""
 _DRIVES_AHEAD = 1.0
-"""m/s; who is faster does not go backwards within the 6 s that are decoded."""
+"""m/s; a faster agent does not reverse within the 6 s that are decoded."""
 _READ_LATERAL_M = (-6.0, -3.5, -1.75, 0.0, 1.75, 3.5, 6.0)
 _READ_AHEAD_M = (0.0, 5.0)
-"""Where the map is read around each position of a mode, m, in the frame of the path there."""
+"""m, points around each position of a mode at which the map is read, in the frame of the path there."""
 _READ_EVERY = 2
-"""Steps from one at which it is read to the next."""
+"""Number of steps from one at which map and neighbours are read to the next."""
 _NARROW_M, _WIDE_M = 1.2, 3.0
-"""Widths across a path within which a neighbour is on it."""
+"""m, scales of the distance across a path within which a neighbour is on it, narrowly and widely."""
 _HALF_LENGTH_M = 3.0
-"""m; a neighbour reaches about that far ahead and behind, the own length included."""
+"""m, extent of a neighbour ahead and behind, the agent's own length included."""
 _GAP_M = 12.0
-"""m, by which what is ahead counts for less."""
-
-
-class MapEncoder(nn.Module):
-    """Convolutions over a map patch: [N, 3, 100, 100] in [-1, 1], 0 unknown → [N, 64]."""
-
-    def __init__(self, dropout: float) -> None:
-        super().__init__()
-        self.convs = nn.ModuleList(
-            [
-                nn.Conv2d(3, 32, 5, stride=5),
-                nn.Conv2d(32, 48, 3, stride=2, padding=1),
-                nn.Conv2d(48, 48, 3, padding=1),
-                nn.Conv2d(48, 48, 3, stride=2, padding=1),
-            ]
-        )
-        self.project = nn.Linear(48 * 5 * 5, _WIDTH)
-        self.dropout = nn.Dropout(dropout)
-
-    def forward(self, patches: Tensor) -> Tensor:
-        patches = patches.contiguous(memory_format=torch.channels_last)
-        for conv in self.convs:
-            patches = F.relu(conv(patches), inplace=True)
-        encoded: Tensor = self.dropout(F.relu(self.project(patches.flatten(1))))
-        return encoded
-
-
-class NeighborEncoder(nn.Module):
-    """Attention of an agent over its neighbours: [N, M, D] → [N, 64].
-
-    A neighbour is a token of its state in the agent's frame; the query is the own history. A learned token
-    stands for "nobody", so that nothing near says something, too.
-    """
-
-    def __init__(self, heads: int = 4) -> None:
-        super().__init__()
-        self.heads = heads
-        self.token = nn.Sequential(
-            nn.Linear(NEIGHBOR_FEATURES + 2, _WIDTH), nn.ReLU(), nn.Linear(_WIDTH, _WIDTH)
-        )
-        self.nobody = nn.Parameter(torch.zeros(_WIDTH))
-        self.query = nn.Linear(_WIDTH, _WIDTH)
-        self.key_value = nn.Linear(_WIDTH, 2 * _WIDTH)
-        self.out = nn.Linear(_WIDTH, _WIDTH)
-
-    def forward(self, neighbors: Tensor, present: Tensor, own: Tensor) -> Tensor:
-        """Return the neighbours' influence: [N, 64].
-
-        Args:
-            neighbors: [N, M, D].
-            present: [N, M] bool, which of them there are.
-            own: [N, 64], the encoded history.
-        """
-        count = own.shape[0]
-        # In which lane a neighbour is matters by the metre where it is near, and little farther away
-        lane = torch.tanh(neighbors[..., :2] * (NEIGHBOR_POSITION_SCALE / neighbors.new_tensor(_NEAR_M)))
-        tokens = F.relu(self.token(torch.cat([neighbors, lane], dim=-1)))
-        tokens = torch.cat([self.nobody.expand(count, 1, -1), tokens], dim=1)
-        there = torch.cat([present.new_ones(count, 1), present], dim=1)
-        key, value = self.key_value(tokens).chunk(2, dim=-1)
-        query = self.query(own).view(count, self.heads, 1, -1)
-        key = key.unflatten(-1, (self.heads, -1)).transpose(1, 2)
-        value = value.unflatten(-1, (self.heads, -1)).transpose(1, 2)
-        scores = (query * key).sum(-1) / math.sqrt(key.shape[-1])  # [N, heads, 1 + M]
-        weights = scores.masked_fill(~there[:, None], -math.inf).softmax(dim=-1)
-        influence: Tensor = F.relu(self.out((weights[..., None] * value).sum(2).flatten(1)))
-        return influence
+"""m, scale on which the influence of a neighbour ahead decays."""
 
 
 class Path(NamedTuple):
@@ -147,30 +83,11 @@ class Path(NamedTuple):
     """m/s, signed along the heading."""
 
 
-def drive(controls: Tensor, heading: Tensor, speed: Tensor) -> Path:
-    """Return the paths of a unicycle, by the midpoint rule; who drives ahead stops before it reverses.
-
-    Args:
-        controls: [N, K, T, 2], heading rate (rad/s) and acceleration (m/s²).
-        heading: [N, K] rad, now.
-        speed: [N, K] m/s, now.
-    """
-    dt = STEP_SECONDS
-    turned, gained = (dt * controls.cumsum(dim=2)).unbind(-1)
-    phi, v = heading[..., None] + turned, speed[..., None] + gained
-    v = torch.where((speed > _DRIVES_AHEAD)[..., None], F.relu(v), v)
-    middle = phi - 0.5 * dt * controls[..., 0]
-    mean_speed = 0.5 * (torch.cat([speed[..., None], v[..., :-1]], dim=-1) + v)
-    x = dt * (mean_speed * middle.cos()).cumsum(dim=2)
-    y = dt * (mean_speed * middle.sin()).cumsum(dim=2)
-    return Path(x, y, phi, v)
-
-
 class Modes(NamedTuple):
-    """What the network says in the agent's frame."""
+    """The output of the network in the agent's frame."""
 
     logits: Tensor
-    """[N, K], of p(z | x)."""
+    """[N, K], logits of p(z | x)."""
     proposal: Path
     path: Path
     sigma: Tensor
@@ -180,8 +97,8 @@ class Modes(NamedTuple):
 class AgentFrameNetwork(nn.Module):
     """The network of vehicles in their own frame, with a full and a blind context.
 
-    Blind is the same network on a null context (CAB, Ben-Younes et al. 2022, section 3): an unknown map and
-    no neighbours, which is also what a call without map and neighbours gives it.
+    A blind forecast is the same network with a null context (CAB, Ben-Younes et al. 2022, section 3): an
+    unknown map and no neighbours, as in a request without map and neighbours.
     """
 
     width: Tensor
@@ -226,12 +143,12 @@ class AgentFrameNetwork(nn.Module):
 
     @property
     def variance_floor(self) -> Tensor:
-        """[T], m², below which no variance of a forecast goes, in any direction."""
+        """[T], m², added to the variances of a forecast, so that it bounds them in any direction."""
         first, last = self.config.min_sigma_m
         return self.width.new_tensor([(first + (last - first) * (s - 1) / 5) ** 2 for s in _SECONDS])
 
     def encode(self, features: Features, context: Context) -> Tensor:
-        """Return the encoding of what the agent may see: [N, 128]."""
+        """Return the encoding of the features: [N, 128]."""
         own = self.history_encoder(features["history"], features["first"])
         parts = [own]
         full = context is Context.FULL
@@ -247,7 +164,7 @@ class AgentFrameNetwork(nn.Module):
         return encoding
 
     def decode(self, encoding: Tensor, features: Features, context: Context) -> Modes:
-        """Return every mode's path and widths in the agent's frame."""
+        """Return every mode's path and standard deviations in the agent's frame."""
         hidden = F.relu(encoding[:, None] + self.modes)
         hidden = hidden + F.relu(self.propose_hidden(hidden))
         proposed = self.propose(hidden)
@@ -267,8 +184,7 @@ class AgentFrameNetwork(nn.Module):
         return Modes(logits, proposal, path, sigma)
 
     def covariance(self, modes: Modes) -> Tensor:
-        """Return the covariances in the agent's frame, no direction of them below the floor:
-        [N, K, T, 2, 2], m²."""
+        """Return the covariances in the agent's frame, at least the floor: [N, K, T, 2, 2], m²."""
         along, across = modes.sigma.square().unbind(-1)
         scale = self.width.square()
         along, across = scale * along + self.variance_floor, scale * across + self.variance_floor
@@ -283,7 +199,7 @@ class AgentFrameNetwork(nn.Module):
         """Return log-probabilities of the modes [N, K], and their positions relative to now, ground frame.
 
         Raises:
-            ValueError: there are more steps than are decoded.
+            ValueError: there are more steps than the network decodes.
         """
         if steps > STEPS:
             raise ValueError(f"this network forecasts {STEPS} steps, not {steps}")
@@ -297,10 +213,10 @@ class AgentFrameNetwork(nn.Module):
         return F.log_softmax(modes.logits / self.temperature, dim=-1), Positions(mean, covariance)
 
     def _read(self, path: Path, features: Features, context: Context) -> Tensor:
-        """Return what is met at every other step of each mode, encoded: [N, K, T/2, 32].
+        """Return the encoding of map and neighbours at every other step of each mode: [N, K, T/2, 32].
 
-        No gradient reaches the path. Each part has a linear layer of its own: to join them first would copy
-        more than it computes.
+        No gradient reaches the path. Each part has its own linear layer: concatenating the parts first would
+        take longer than the products.
         """
         x, y, heading, speed = (part.detach()[..., _READ_EVERY - 1 :: _READ_EVERY] for part in path)
         where = torch.stack([x / 30, y / 30, heading, speed / 15], dim=-1)
@@ -321,14 +237,107 @@ class AgentFrameNetwork(nn.Module):
         return F.relu(read, inplace=True)
 
 
+class NeighborEncoder(nn.Module):
+    """Attention of an agent over its neighbours: [N, M, D] → [N, 64].
+
+    Each neighbour is a token of its state in the agent's frame; the query is the own history. A learned token
+    stands for "nobody", so that the absence of neighbours is information, too.
+    """
+
+    def __init__(self, heads: int = 4) -> None:
+        super().__init__()
+        self.heads = heads
+        self.token = nn.Sequential(
+            nn.Linear(NEIGHBOR_FEATURES + 2, _WIDTH), nn.ReLU(), nn.Linear(_WIDTH, _WIDTH)
+        )
+        self.nobody = nn.Parameter(torch.zeros(_WIDTH))
+        self.query = nn.Linear(_WIDTH, _WIDTH)
+        self.key_value = nn.Linear(_WIDTH, 2 * _WIDTH)
+        self.out = nn.Linear(_WIDTH, _WIDTH)
+
+    def forward(self, neighbors: Tensor, present: Tensor, own: Tensor) -> Tensor:
+        """Return the neighbours' influence: [N, 64].
+
+        Args:
+            neighbors: [N, M, D].
+            present: [N, M] bool, False in the padding.
+            own: [N, 64], the encoded history.
+        """
+        count = own.shape[0]
+        # The lane of a near neighbour matters by the metre, that of a far one little
+        lane = torch.tanh(neighbors[..., :2] * (NEIGHBOR_POSITION_SCALE / neighbors.new_tensor(_NEAR_M)))
+        tokens = F.relu(self.token(torch.cat([neighbors, lane], dim=-1)))
+        tokens = torch.cat([self.nobody.expand(count, 1, -1), tokens], dim=1)
+        there = torch.cat([present.new_ones(count, 1), present], dim=1)
+        key, value = self.key_value(tokens).chunk(2, dim=-1)
+        query = self.query(own).view(count, self.heads, 1, -1)
+        key = key.unflatten(-1, (self.heads, -1)).transpose(1, 2)
+        value = value.unflatten(-1, (self.heads, -1)).transpose(1, 2)
+        scores = (query * key).sum(-1) / math.sqrt(key.shape[-1])  # [N, heads, 1 + M]
+        weights = scores.masked_fill(~there[:, None], -math.inf).softmax(dim=-1)
+        influence: Tensor = F.relu(self.out((weights[..., None] * value).sum(2).flatten(1)))
+        return influence
+
+
+class MapEncoder(nn.Module):
+    """Convolutions over a map patch: [N, 3, 100, 100] in [-1, 1], 0 unknown → [N, 64]."""
+
+    def __init__(self, dropout: float) -> None:
+        super().__init__()
+        self.convs = nn.ModuleList(
+            [
+                nn.Conv2d(3, 32, 5, stride=5),
+                nn.Conv2d(32, 48, 3, stride=2, padding=1),
+                nn.Conv2d(48, 48, 3, padding=1),
+                nn.Conv2d(48, 48, 3, stride=2, padding=1),
+            ]
+        )
+        self.project = nn.Linear(48 * 5 * 5, _WIDTH)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, patches: Tensor) -> Tensor:
+        patches = patches.contiguous(memory_format=torch.channels_last)
+        for conv in self.convs:
+            patches = F.relu(conv(patches), inplace=True)
+        encoded: Tensor = self.dropout(F.relu(self.project(patches.flatten(1))))
+        return encoded
+
+
+def _neighbors(features: Features, full: bool) -> tuple[Tensor, Tensor]:
+    """Return neighbours [N, M, D], and which are present [N, M]; blind: one absent neighbour."""
+    neighbors = features["neighbors"] if full else features["history"].new_zeros(1, 1, NEIGHBOR_FEATURES)
+    if not full:
+        neighbors = neighbors.expand(features["history"].shape[0], -1, -1)
+    return neighbors, neighbors[..., -1] > 0
+
+
+def drive(controls: Tensor, heading: Tensor, speed: Tensor) -> Path:
+    """Integrate the paths of a unicycle by the midpoint rule; an agent that drives ahead never reverses.
+
+    Args:
+        controls: [N, K, T, 2], heading rate (rad/s) and acceleration (m/s²).
+        heading: [N, K] rad, now.
+        speed: [N, K] m/s, now.
+    """
+    dt = STEP_SECONDS
+    turned, gained = (dt * controls.cumsum(dim=2)).unbind(-1)
+    phi, v = heading[..., None] + turned, speed[..., None] + gained
+    v = torch.where((speed > _DRIVES_AHEAD)[..., None], F.relu(v), v)
+    middle = phi - 0.5 * dt * controls[..., 0]
+    mean_speed = 0.5 * (torch.cat([speed[..., None], v[..., :-1]], dim=-1) + v)
+    x = dt * (mean_speed * middle.cos()).cumsum(dim=2)
+    y = dt * (mean_speed * middle.sin()).cumsum(dim=2)
+    return Path(x, y, phi, v)
+
+
 def read_patch(patches: Tensor, x: Tensor, y: Tensor, geometry: PatchGeometry) -> Tensor:
-    """Return a patch's layers at points in its agent's frame, bilinear, 0 (unknown) outside.
+    """Sample a patch's layers at points in its agent's frame, bilinearly; 0 (unknown) outside.
 
     Args:
         patches: [N, 3, S, S].
         x: [N, …] m ahead.
         y: [N, …] m to the left.
-        geometry: of the patches.
+        geometry: geometry of the patches.
 
     Returns:
         [N, 3, …].
@@ -342,18 +351,11 @@ def read_patch(patches: Tensor, x: Tensor, y: Tensor, geometry: PatchGeometry) -
     return layers
 
 
-def _neighbors(features: Features, full: bool) -> tuple[Tensor, Tensor]:
-    neighbors = features["neighbors"] if full else features["history"].new_zeros(1, 1, NEIGHBOR_FEATURES)
-    if not full:
-        neighbors = neighbors.expand(features["history"].shape[0], -1, -1)
-    return neighbors, neighbors[..., -1] > 0
-
-
 def _in_the_way(path: Path, features: Features) -> Tensor:
-    """Return how much neighbours are in the way of each mode if they go on as now: [N, K, T', 3].
+    """Return the degree to which neighbours of constant velocity are in the way of each mode: [N, K, T', 3].
 
-    Between one read step and the next, in the frame of the path there: whether a neighbour lies on the path,
-    narrowly and widely, and how near ahead of it one is.
+    Between one read step and the next, in the frame of the path there: the presence of a neighbour on the
+    path, narrowly and widely, and the nearness of one ahead.
     """
     neighbors = features["neighbors"]
     ahead, aside, gone = _beside(path, neighbors, _READ_EVERY)
@@ -366,11 +368,11 @@ def _in_the_way(path: Path, features: Features) -> Tensor:
 
 
 def drives_through(path: Path, neighbors: Tensor) -> Tensor:
-    """Return how nearly each mode drives through each neighbour that goes on as now: [N, K, M], 0 to 1.
+    """Return the degree, 0 to 1, to which modes drive through neighbours of constant velocity: [N, K, M].
 
     Args:
-        path: of all steps.
-        neighbors: [N, M, 11]; where nobody is, nothing is said.
+        path: path of all steps.
+        neighbors: [N, M, 11]; results for padding are meaningless.
     """
     ahead, aside, gone = _beside(path, neighbors, 1)
     through: Tensor = ((-aside.square() / (2 * _NARROW_M**2)).exp() * _reached(ahead, gone)).amax(dim=-1)
@@ -378,16 +380,16 @@ def drives_through(path: Path, neighbors: Tensor) -> Tensor:
 
 
 def _beside(path: Path, neighbors: Tensor, every: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return where neighbours are beside a path if they go on as now, in its frame at each of its steps.
+    """Return positions of neighbours of constant velocity in the frame of a path at each of its steps.
 
     Args:
-        path: at each ``every``-th step.
+        path: path at each ``every``-th step.
         neighbors: [N, M, 11].
-        every: steps of 0.5 s from one of the path's to the next.
+        every: number of 0.5 s steps between the path's steps.
 
     Returns:
-        m ahead and m to the left: [N, K, M, T'] each; m that the path went since the step before:
-        [N, K, 1, T'].
+        Distances ahead and to the left, [N, K, M, T'] each, m; the path's length since its previous step,
+        [N, K, 1, T'], m.
     """
     x, y, heading, _ = path
     steps = torch.arange(every, STEPS + 1, every, dtype=x.dtype, device=x.device)
@@ -407,5 +409,5 @@ def _beside(path: Path, neighbors: Tensor, every: int) -> tuple[Tensor, Tensor, 
 
 
 def _reached(ahead: Tensor, gone: Tensor) -> Tensor:
-    """Return whether a neighbour is met between a step and the one before: near 1 where it is."""
+    """Return the degree, 0 to 1, to which a neighbour is met between a step and the previous one."""
     return torch.sigmoid(ahead + gone + _HALF_LENGTH_M) * torch.sigmoid(_HALF_LENGTH_M - ahead)
