@@ -1,9 +1,10 @@
-"""The benchmark: replays recorded scenes through a running endpoint, and judges its answers.
+"""The benchmark: recorded scenes replayed through a running endpoint or in this process, and evaluated.
 
-A client of the contract, as any other: what forecasts is behind the endpoint. Ben-Younes et al. 2022
-(arXiv 2109.08048), section 4 and its tables.
+It is a client of the contract and does not know what forecasts behind an endpoint. Metrics and tables follow
+Ben-Younes et al. 2022 (arXiv 2109.08048), section 4.
 """
 
+from benchmark.errors import BenchmarkError
+from benchmark.run import Benchmark, BenchmarkRun, Endpoint, Progress, run_benchmark
 
-class BenchmarkError(Exception):
-    """The benchmark cannot go on as asked; the text says why."""
+__all__ = ["Benchmark", "BenchmarkError", "BenchmarkRun", "Endpoint", "Progress", "run_benchmark"]

@@ -1,4 +1,4 @@
-"""Saved answers of one scene as arrays, in the order of what was asked."""
+"""Saved answers of one model about one scene, as arrays in the order of the pairs."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -7,65 +7,65 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from benchmark import BenchmarkError
 from benchmark.archive import Answer, Archive
+from benchmark.errors import BenchmarkError
 from benchmark.plan import PlannedScene, full_history
 from cab_forecast import Forecast, forecasts
 from model.arrays import Floats, Ints
 from model.mixture import TrajectoryMixture
 
 MISSING = "MISSING"
-"""Status of an instance that was never answered; the others are the contract's."""
+"""Status of a pair without a response; the other statuses are those of the contract."""
 
 
 @dataclass(frozen=True)
 class CallTimes:
-    """Of C calls, [C] each."""
+    """Durations of C calls, [C] each."""
 
     seconds: Floats
-    """That the client waited."""
+    """Time that the client waited."""
     queue_seconds: Floats
-    """Of these before the model started."""
+    """Time before the model started."""
     inference_seconds: Floats
-    """Inside the model."""
+    """Time inside the model."""
     batch_agents: Floats
-    """Agents in the batch that it rode in."""
+    """Agents in the batch of the call."""
 
 
 @dataclass(frozen=True)
 class SceneAnswers:
-    """What one model said about one scene."""
+    """Answers of one model about one scene."""
 
     instances: Ints
-    """[N], which of the scene's pairs have a forecast, ascending."""
+    """[N], indices of the scene's pairs with a forecast, ascending."""
     mixture: TrajectoryMixture | None
-    """Of these; None: there are none."""
+    """Forecasts of these pairs; None: there are none."""
     statuses: Mapping[str, int]
-    """How many pairs came out how."""
+    """Number of pairs by status."""
     lost: int
-    """Forecasts that were asked for dispersion and convergence alone, and did not come."""
-    likeliest: Mapping[int, tuple[Ints, Floats]]
-    """By track: frames [F] at which it has a full history, ascending, and the most likely trajectories
-    [F, T, 2] that were made there, m, ground frame."""
+    """Missing forecasts among those requested for dispersion and convergence only."""
+    most_likely: Mapping[int, tuple[Ints, Floats]]
+    """By track: frames [F] of full history, ascending, and the most likely trajectories [F, T, 2] forecast
+    at these frames, m, ground frame."""
     times: CallTimes
 
 
 def read_answers(archive: Archive, model: str, scene: PlannedScene) -> SceneAnswers:
-    """Reads what is saved.
+    """Read the answers of a model about a scene.
 
     Args:
-        archive: of the answers.
+        archive: the saved answers.
         model: ``name@version``.
-        scene: what was asked.
+        scene: the planned scene.
 
     Raises:
-        BenchmarkError: an answer contradicts itself, or what was asked.
+        BenchmarkError: an answer contradicts itself, or does not fit its call.
     """
     try:
         return _read(archive, model, scene)
     except (ValueError, KeyError, IndexError) as error:
         where = f"{model}, {scene.record.name}"
-        raise BenchmarkError(f"{where}: an answer does not fit what was asked: {error!r}") from error
+        raise BenchmarkError(f"{where}: an answer does not fit its call: {error!r}") from error
 
 
 def _read(archive: Archive, model: str, scene: PlannedScene) -> SceneAnswers:
@@ -108,13 +108,15 @@ def _read(archive: Archive, model: str, scene: PlannedScene) -> SceneAnswers:
 
 
 def _stacked(made: Sequence[tuple[int, Floats]]) -> tuple[Ints, Floats]:
-    """Frames, which the archive gives in order, and trajectories as arrays."""
+    """Return frames, which the archive yields in order, and trajectories as arrays."""
     return np.array([frame for frame, _ in made], dtype=np.int64), np.stack([path for _, path in made])
 
 
 def _mixture(found: Sequence[Forecast], origin: Floats) -> TrajectoryMixture:
-    """Forecasts as one batch. One with fewer modes than others (a fallback) gets more of no weight, which are
-    its first one over again."""
+    """Return forecasts as one batch.
+
+    A forecast with fewer modes than others (a fallback) is padded with copies of its first mode of weight 0.
+    """
     modes = max(len(one.weights) for one in found)
     weights = np.zeros((len(found), modes))
     means, covariances = [], []
@@ -126,7 +128,7 @@ def _mixture(found: Sequence[Forecast], origin: Floats) -> TrajectoryMixture:
         covariances.append(one.covariances[kept])
     with np.errstate(divide="ignore"):
         log_weights = np.log(weights / weights.sum(axis=1, keepdims=True))
-    # What a network computed in float32 comes back as it was: the rest is exact
+    # Subtracting the origin restores the network's float32 values exactly
     return TrajectoryMixture(
         torch.from_numpy(log_weights).float(),
         torch.from_numpy(np.stack(means)).float(),

@@ -1,7 +1,8 @@
-"""Answers on disk, in one SQLite file: what has been asked is never asked again.
+"""Saved answers of a run, in one SQLite file.
 
-Each answer is committed as it comes, so that a run that was killed has all it got; metrics are always of what
-is here, so that a resumed run, and one that only reads, find the same.
+Each answer is committed as it arrives, so that a run that was killed loses none and requests none twice.
+Metrics are always computed from the saved answers, so that a resumed run and a later evaluation give the same
+figures.
 """
 
 import sqlite3
@@ -12,13 +13,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from benchmark import BenchmarkError
+from benchmark.errors import BenchmarkError
 from benchmark.plan import Call
 from cab.forecast.v1.model_service_pb2 import Model
 from cab.forecast.v1.prediction_service_pb2 import PredictResponse
 
 FILE = "answers.sqlite"
-"""In a run's folder."""
+"""Name of the file in the folder of a run."""
 
 _TABLES = """
 CREATE TABLE IF NOT EXISTS run (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
@@ -36,7 +37,7 @@ CREATE TABLE IF NOT EXISTS refusals (
 
 @dataclass(frozen=True)
 class Refusal:
-    """A call that the endpoint would not answer."""
+    """A call that the endpoint refused."""
 
     model: str
     scene: str
@@ -46,10 +47,10 @@ class Refusal:
 
 @dataclass(frozen=True)
 class Answer:
-    """What the endpoint said to one call."""
+    """Response to one call."""
 
     seconds: float
-    """That the client waited."""
+    """Time that the client waited."""
     response: PredictResponse
 
 
@@ -57,11 +58,11 @@ class Archive:
     """The answers of one run.
 
     Args:
-        folder: of the run; made where it does not exist.
-        read_only: whether there must be answers already; nothing is then written.
+        folder: folder of the run, created if missing.
+        read_only: whether to only read; the file must exist.
 
     Raises:
-        BenchmarkError: it cannot be opened, or there is nothing to read.
+        BenchmarkError: the file cannot be opened, or does not exist.
     """
 
     def __init__(self, folder: Path, read_only: bool = False) -> None:
@@ -74,7 +75,8 @@ class Archive:
             raise BenchmarkError(f"{self._path}: cannot be used for answers: {error}") from error
 
     def _open_to_read(self) -> sqlite3.Connection:
-        # Without a log beside it nobody writes to it, and then it may lie where not even SQLite can write
+        # Without a write-ahead log there is no writer. The file can then be read even where SQLite cannot
+        # create its lock files.
         settled = not self._path.with_name(f"{FILE}-wal").exists()
         how = "mode=ro&immutable=1" if settled else "mode=ro"
         file = sqlite3.connect(f"{self._path.resolve().as_uri()}?{how}", uri=True)
@@ -89,7 +91,7 @@ class Archive:
         folder.mkdir(parents=True, exist_ok=True)
         file = sqlite3.connect(self._path, isolation_level=None)
         try:
-            # A commit then waits for no disk: a killed process loses nothing, a power cut the last answers
+            # Commits do not wait for the disk: a killed process loses nothing, a power cut the last answers
             file.execute("PRAGMA journal_mode = WAL")
             file.execute("PRAGMA synchronous = NORMAL")
             file.executescript(_TABLES)
@@ -107,14 +109,17 @@ class Archive:
         self.close()
 
     def close(self) -> None:
-        """Ends its use."""
+        """Close the file."""
         self._file.close()
 
     def check(self, facts: Mapping[str, str]) -> None:
-        """Whether its answers are to what is asked.
+        """Refuse answers of another run.
+
+        Args:
+            facts: properties of this run by name.
 
         Raises:
-            BenchmarkError: they are to something else; names what differs.
+            BenchmarkError: a property differs; the text names it.
         """
         known = self.facts()
         for name, value in facts.items():
@@ -125,34 +130,37 @@ class Archive:
                 )
 
     def bind(self, facts: Mapping[str, str]) -> None:
-        """Ties the archive to what is asked.
+        """Bind the archive to a run.
+
+        Args:
+            facts: properties of the run by name.
 
         Raises:
-            BenchmarkError: as ``check``.
+            BenchmarkError: the archive holds answers of another run.
         """
         self.check(facts)
         self._file.executemany("INSERT OR REPLACE INTO run VALUES (?, ?)", facts.items())
 
     def note(self, name: str, value: str) -> None:
-        """Notes a fact that may change from one time to the next."""
+        """Record a property that may differ between two replays of a run."""
         self._file.execute("INSERT OR REPLACE INTO run VALUES (?, ?)", (name, value))
 
     def facts(self) -> dict[str, str]:
-        """What it is tied to, and what was noted."""
+        """Return all recorded properties."""
         return dict(self._file.execute("SELECT key, value FROM run"))
 
     def register(self, key: str, model: Model) -> None:
-        """Notes a model whose answers will come.
+        """Record a model before its answers.
 
-        Its description is compared, which is all that a client knows of its weights.
+        Models are compared by their descriptions, as a client does not know their weights.
 
         Raises:
-            BenchmarkError: answers of a model of another description are here under that name.
+            BenchmarkError: the archive holds answers of another model of that name.
         """
         known = self.models().get(key)
         if known is not None and not _same(known, model):
             raise BenchmarkError(
-                f"{self._path}: {key} of the endpoint is not the one whose answers are here; "
+                f"{self._path}: {key} of the endpoint is not the model whose answers are saved; "
                 "give another folder"
             )
         row = (key, model.SerializeToString())
@@ -161,32 +169,32 @@ class Archive:
         )
 
     def models(self) -> dict[str, Model]:
-        """Models that have been asked, by ``name@version``, in the order of their registration."""
+        """Return the recorded models by ``name@version``, in the order of registration."""
         rows = self._file.execute("SELECT key, model FROM models ORDER BY rowid")
         return {key: Model.FromString(model) for key, model in rows}
 
     def answered(self) -> set[tuple[str, str, int]]:
-        """Model, scene and frame of every call that has its answer."""
+        """Return model, scene and frame of every call with an answer."""
         return set(self._file.execute("SELECT model, scene, frame FROM answers"))
 
     def add(self, model: str, scene: str, call: Call, answer: Answer) -> None:
-        """Keeps an answer; a refusal of the same call is forgotten."""
+        """Save an answer, and delete a refusal of the same call."""
         row = (model, scene, call.frame, answer.seconds, answer.response.SerializeToString())
         self._file.execute("INSERT OR REPLACE INTO answers VALUES (?, ?, ?, ?, ?)", row)
         self._file.execute("DELETE FROM refusals WHERE model = ? AND scene = ? AND frame = ?", row[:3])
 
     def refuse(self, model: str, scene: str, call: Call, why: str) -> None:
-        """Keeps that a call was refused."""
+        """Save the refusal of a call."""
         row = (model, scene, call.frame, why)
         self._file.execute("INSERT OR REPLACE INTO refusals VALUES (?, ?, ?, ?)", row)
 
     def refusals(self) -> list[Refusal]:
-        """Calls that were refused and have no answer since."""
+        """Return the refused calls without a later answer."""
         rows = self._file.execute("SELECT model, scene, frame, why FROM refusals ORDER BY rowid")
         return [Refusal(*row) for row in rows]
 
     def answers(self, model: str, scene: str) -> Iterator[tuple[int, Answer]]:
-        """Frame and answer of every call about a scene, by frame."""
+        """Yield frame and answer of every call about a scene, by frame."""
         rows = self._file.execute(
             "SELECT frame, seconds, response FROM answers WHERE model = ? AND scene = ? ORDER BY frame",
             (model, scene),
@@ -197,7 +205,7 @@ class Archive:
 
 
 def _same(known: Model, model: Model) -> bool:
-    """Whether two descriptions are of the same model; words and figures about it may be mended."""
+    """Return whether two descriptions are of the same model; texts and figures may differ."""
     plain = [Model.FromString(one.SerializeToString()) for one in (known, model)]
     for one in plain:
         for field in ("is_default", "description", "benchmark", "license"):

@@ -1,16 +1,21 @@
-"""Two runs beside each other: what differs between them, and whether the difference is more than noise."""
+"""Comparison of two runs, with the uncertainty of the differences.
+
+If both runs hold figures of the same pairs, a difference is the mean over the pairs that both have. Its 95 %
+interval is a percentile bootstrap over scenes (``RESAMPLES`` resamples, seed ``SEED``): pairs of one scene
+are alike, so whole scenes are resampled.
+"""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
-from benchmark import BenchmarkError
-from benchmark.results import INSTANCES_FILE, PER_INSTANCE, ModelResult, Results, read_instances
-from model.arrays import Floats
-from model.evaluation.text_tables import Table, document, number, signed
+from benchmark.results import PER_INSTANCE, BenchmarkModelResult, BenchmarkResults, Instances
+from model.arrays import Floats, Ints
+from model.evaluation.tables import UNKNOWN, Table, document, number, signed
 
 KEY_FIGURES = {
     "ADE-ML 6 s": "ade_ml_6s_m",
@@ -27,7 +32,13 @@ KEY_FIGURES = {
     "FDE, hardest 3 %": "fde_hardest_3_m",
 }
 CLEAR = 2.0
-"""Standard errors that a difference must exceed to be called clear."""
+"""Standard errors that a clear difference exceeds."""
+RESAMPLES: Final = 2000
+"""Bootstrap resamples of the scenes."""
+SEED: Final = 0
+"""Seed of the bootstrap."""
+LEVEL: Final = 0.95
+"""Probability that an interval is to hold."""
 
 _SETTINGS = (
     "protocol",
@@ -47,24 +58,29 @@ _DIGEST_SHOWN = 12
 
 @dataclass(frozen=True)
 class Difference:
-    """One figure of one model in both runs."""
+    """Difference of one figure of one model between the runs."""
 
     figure: str
     a: float
     b: float
     difference: float
-    """B − A; where there are pairs, its mean over those that both have."""
+    """B − A; in a paired comparison, its mean over the pairs that both runs have."""
     standard_error: float
-    """Of that mean; NaN where the pairs cannot be compared one by one."""
+    """Standard error of that mean as if pairs were independent; NaN without a paired comparison."""
     pairs: int
-    """How many both have; 0: not compared one by one."""
+    """Number of compared pairs; 0: no paired comparison."""
+    interval: tuple[float, float] = (math.nan, math.nan)
+    """95 % interval of the difference by bootstrap over scenes; NaN where the scenes are unknown or fewer
+    than two."""
 
     @property
     def clear(self) -> bool | None:
-        """Whether it is more than noise; None: unknown."""
+        """Whether the difference exceeds two standard errors and its interval, if known, excludes 0; None:
+        unknown."""
         if math.isnan(self.standard_error) or math.isnan(self.difference):
             return None
-        return abs(self.difference) > CLEAR * self.standard_error
+        low, high = self.interval
+        return abs(self.difference) > CLEAR * self.standard_error and not low <= 0 <= high
 
 
 @dataclass(frozen=True)
@@ -72,44 +88,45 @@ class ComparedModel:
     """A model that is in both runs."""
 
     a: str
-    """Its ``name@version`` there."""
+    """``name@version`` in A."""
     b: str
+    """``name@version`` in B."""
     differences: tuple[Difference, ...]
 
     @property
     def label(self) -> str:
-        """Its ``name@version``, or both of them."""
+        """``name@version``, or both of them."""
         return self.a if self.a == self.b else f"{self.a} → {self.b}"
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Of run B with run A."""
+    """Comparison of run B with run A."""
 
     a: Path
     b: Path
     remarks: tuple[str, ...]
-    """What differs between the runs besides figures, in words."""
+    """Differences between the runs besides figures, in words."""
     models: tuple[ComparedModel, ...]
     only_a: tuple[str, ...]
-    """``name@version`` of models that B has no counterpart of."""
+    """``name@version`` of models without a counterpart in B."""
     only_b: tuple[str, ...]
 
 
 def compare(a: Path, b: Path) -> Comparison:
-    """Compares two runs.
+    """Compare two runs.
 
-    A model of A is compared with that of the same ``name@version`` in B; of what is left then, with the one
-    of the same name, if each run has just one.
+    A model of A is compared with the model of the same ``name@version`` in B; the remaining ones with the
+    model of the same name, if each run has just one.
 
     Args:
         a: folder of a run.
-        b: folder of another one.
+        b: folder of another run.
 
     Raises:
-        BenchmarkError: one holds no results, or damaged ones; names the file.
+        BenchmarkError: a folder has no results, or damaged ones; the text names the file.
     """
-    results = (Results.read(a), Results.read(b))
+    results = (BenchmarkResults.read(a), BenchmarkResults.read(b))
     instances, unpaired = _paired_instances((a, b), results)
     matches = list(_matches(*results))
     return Comparison(
@@ -125,7 +142,7 @@ def compare(a: Path, b: Path) -> Comparison:
 
 
 def markdown(comparison: Comparison) -> str:
-    """As a document: what is to be known first, then the differences."""
+    """Return the comparison as a document: remarks first, then the differences."""
     lines = [f"A: {comparison.a}", f"B: {comparison.b}", *comparison.remarks]
     for run, names in (("A", comparison.only_a), ("B", comparison.only_b)):
         if names:
@@ -135,19 +152,22 @@ def markdown(comparison: Comparison) -> str:
 
 
 def table(comparison: Comparison) -> Table:
-    """All differences."""
+    """Return all differences as a table."""
     rows = tuple(_row(model, one) for model in comparison.models for one in model.differences)
     note = (
-        "B − A; where pairs can be compared one by one, over those that both runs have, with the standard "
-        f"error of its mean; clear: more than {CLEAR:g} standard errors. Pairs of one agent are alike, so "
-        "the true error is somewhat greater."
+        "B − A; in a paired comparison, the mean over the pairs of both runs, with its standard error as if "
+        f"pairs were independent, and its {LEVEL:.0%} interval by bootstrap over scenes ({RESAMPLES} "
+        f"resamples, seed {SEED}; none for fewer than two scenes, or if neither run recorded them). Clear: "
+        f"more than {CLEAR:g} standard errors, and an interval without 0."
     )
-    columns = ("model", "figure", "A", "B", "B − A", "standard error", "pairs", "clear")
+    columns = ("model", "figure", "A", "B", "B − A", "standard error", "95 % interval", "pairs", "clear")
     return Table("Differences", note, columns, rows)
 
 
-def _matches(a: Results, b: Results) -> Iterator[tuple[ModelResult, ModelResult]]:
-    """In A's order."""
+def _matches(
+    a: BenchmarkResults, b: BenchmarkResults
+) -> Iterator[tuple[BenchmarkModelResult, BenchmarkModelResult]]:
+    """Yield the compared models in A's order."""
     same = {model.key: model for model in b.models if model.key in {one.key for one in a.models}}
     for one in a.models:
         if one.key in same:
@@ -161,12 +181,12 @@ def _matches(a: Results, b: Results) -> Iterator[tuple[ModelResult, ModelResult]
             yield one, others[0]
 
 
-def _unmatched(results: Results, matched: set[str]) -> tuple[str, ...]:
+def _unmatched(results: BenchmarkResults, matched: set[str]) -> tuple[str, ...]:
     return tuple(model.key for model in results.models if model.key not in matched)
 
 
-def _settings(a: Results, b: Results) -> Iterator[str]:
-    """What was asked differently, and by what."""
+def _settings(a: BenchmarkResults, b: BenchmarkResults) -> Iterator[str]:
+    """Yield the differing settings of the runs."""
     for name in (*_SETTINGS, "endpoint", "version"):
         values = [getattr(results, name) for results in (a, b)]
         if values[0] == values[1]:
@@ -187,8 +207,8 @@ def _word(value: object) -> str:
     return str(value)
 
 
-def _models(matches: Sequence[tuple[ModelResult, ModelResult]]) -> Iterator[str]:
-    """What differs about models that are in both."""
+def _models(matches: Sequence[tuple[BenchmarkModelResult, BenchmarkModelResult]]) -> Iterator[str]:
+    """Yield the differences of models in both runs."""
     for one, other in matches:
         facts = {
             "version": (one.version, other.version),
@@ -201,58 +221,84 @@ def _models(matches: Sequence[tuple[ModelResult, ModelResult]]) -> Iterator[str]
                 yield f"{one.name}, {fact}: {was} in A, {now} in B"
 
 
-_Instances = Mapping[str, Floats]
-
-
 def _paired_instances(
-    folders: tuple[Path, Path], results: tuple[Results, Results]
-) -> tuple[tuple[_Instances, _Instances], list[str]]:
-    """Figures of each pair, by ``<name@version>/<figure>`` [pairs], and why there are none."""
-    none: tuple[_Instances, _Instances] = ({}, {})
+    folders: tuple[Path, Path], results: tuple[BenchmarkResults, BenchmarkResults]
+) -> tuple[tuple[Instances, Instances], list[str]]:
+    """Return the figures of each pair in both runs, and why there are none."""
+    none = (Instances({}), Instances({}))
     if results[0].plan != results[1].plan or results[0].pairs != results[1].pairs:
-        return none, ["the runs are of other pairs or plans: no comparison pair by pair"]
-    found = (_instances(folders[0], results[0]), _instances(folders[1], results[1]))
-    lacking = [run for run, instances in zip("AB", found, strict=True) if not instances]
+        return none, ["the runs are of other pairs or plans: no paired comparison"]
+    a, b = (Instances.read(folder, one.pairs) for folder, one in zip(folders, results, strict=True))
+    lacking = [run for run, instances in zip("AB", (a, b), strict=True) if not instances.figures]
     if lacking:
-        return none, [f"no figures of each pair in {' and '.join(lacking)}: no comparison pair by pair"]
-    return found, []
-
-
-def _instances(folder: Path, results: Results) -> _Instances:
-    found = read_instances(folder)
-    for name, values in found.items():
-        if values.shape != (results.pairs,):
-            raise BenchmarkError(
-                f"{folder / INSTANCES_FILE}: {name} is of {list(values.shape)}, not of {results.pairs} pairs"
-            )
-    return found
+        return none, [f"no figures of each pair in {' and '.join(lacking)}: no paired comparison"]
+    return (a, b), []
 
 
 def _differences(
-    one: ModelResult, other: ModelResult, a: _Instances, b: _Instances
+    one: BenchmarkModelResult, other: BenchmarkModelResult, a: Instances, b: Instances
 ) -> tuple[Difference, ...]:
-    """Of all figures that one of them has at least."""
+    """Return the differences of all figures that at least one of the models has."""
+    scenes = b.scenes if a.scenes is None else a.scenes  # the plans are equal, and so are the scenes
     found = []
     for figure, name in KEY_FIGURES.items():
         was, now = (model.metrics.get(name, math.nan) for model in (one, other))
         if math.isnan(was) and math.isnan(now):
             continue
         keys = f"{one.key}/{name}", f"{other.key}/{name}"
-        if name in PER_INSTANCE and keys[0] in a and keys[1] in b:
-            found.append(Difference(figure, was, now, *_mean_difference(a[keys[0]], b[keys[1]])))
+        if name in PER_INSTANCE and keys[0] in a.figures and keys[1] in b.figures:
+            pairs = (a.figures[keys[0]], b.figures[keys[1]])
+            found.append(_paired_difference(figure, was, now, *pairs, scenes))
         else:
             found.append(Difference(figure, was, now, now - was, math.nan, 0))
     return tuple(found)
 
 
-def _mean_difference(a: Floats, b: Floats) -> tuple[float, float, int]:
-    """Mean of B − A, its standard error, and over how many: a, b [N], NaN where missing."""
+def _paired_difference(
+    figure: str, was: float, now: float, a: Floats, b: Floats, scenes: Ints | None
+) -> Difference:
+    """Return the mean of B − A with its uncertainty.
+
+    Args:
+        figure: name of the figure.
+        was: mean of the figure in A.
+        now: mean of the figure in B.
+        a: [N], the figure of each pair in A; NaN where missing.
+        b: [N], likewise in B.
+        scenes: [N], index of each pair's scene; None: unknown.
+    """
     both = np.isfinite(a) & np.isfinite(b)
-    apart = b[both] - a[both]
-    count = len(apart)
-    mean = float(apart.mean()) if count else math.nan
-    error = float(apart.std(ddof=1)) / math.sqrt(count) if count > 1 else math.nan
-    return mean, error, count
+    differences = b[both] - a[both]
+    count = len(differences)
+    mean = float(differences.mean()) if count else math.nan
+    error = float(differences.std(ddof=1)) / math.sqrt(count) if count > 1 else math.nan
+    interval = (math.nan, math.nan) if scenes is None else bootstrap_interval(differences, scenes[both])
+    return Difference(figure, was, now, mean, error, count, interval)
+
+
+def bootstrap_interval(values: Floats, scenes: Ints) -> tuple[float, float]:
+    """Return the 95 % interval of a mean by bootstrap over scenes (Efron's percentile interval).
+
+    Each of ``RESAMPLES`` resamples draws as many scenes as there are, with replacement, and takes the mean
+    over all their values. Equal scenes give equal resamples, whatever the values.
+
+    Args:
+        values: [N], finite.
+        scenes: [N], index of each value's scene.
+
+    Returns:
+        Lower and upper bound; NaN for fewer than two scenes.
+    """
+    distinct, members = np.unique(scenes, return_inverse=True)
+    count = len(distinct)
+    if count < 2:
+        return math.nan, math.nan
+    sums, sizes = np.bincount(members, values), np.bincount(members)
+    generator = np.random.default_rng(SEED)
+    drawn = generator.multinomial(count, np.full(count, 1 / count), size=RESAMPLES)
+    means = (drawn @ sums) / (drawn @ sizes)
+    low, high = np.quantile(means, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    return float(low), float(high)
 
 
 def _row(model: ComparedModel, one: Difference) -> tuple[str, ...]:
@@ -264,6 +310,12 @@ def _row(model: ComparedModel, one: Difference) -> tuple[str, ...]:
         number(one.b, 3),
         signed(one.difference, 3),
         number(one.standard_error, 3),
+        _interval(one.interval),
         number(one.pairs),
         clear,
     )
+
+
+def _interval(bounds: tuple[float, float]) -> str:
+    low, high = (signed(bound, 3) for bound in bounds)
+    return UNKNOWN if math.isnan(bounds[0]) else f"{low} … {high}"

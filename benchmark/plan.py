@@ -1,4 +1,4 @@
-"""What is asked of the endpoint: calls of one scene and frame each."""
+"""The forecasts that a benchmark requests: calls of one scene and frame each."""
 
 import hashlib
 from collections import defaultdict
@@ -7,89 +7,60 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.arrays import Bools, Floats, Ints
-from model.data.checks import STEPS_AHEAD, check_pairs
-from model.data.scenes import DataError, Pair, Reader, SceneRecord
+from model.arrays import Ints
+from model.data.scenes import Pair, Reader, SceneRecord
+from model.evaluation.pairs import ScenePairs, split_pairs
 
 HISTORY_FRAMES = 5
-"""Frames of a full history, now included (the paper's H = 4 past ones)."""
+"""Frames of a full history, including now (the paper's H = 4 past ones)."""
 
 
 @dataclass(frozen=True)
 class Call:
-    """Forecasts of some agents of one frame."""
+    """Forecasts of some agents at one frame."""
 
     frame: int
     tracks: tuple[int, ...]
-    """Those to be forecast: indices into the scene's tracks, ascending."""
+    """Indices of the agents' tracks in the scene, ascending."""
     due: frozenset[int]
-    """Those of them that the challenge asks for at this frame. The others are asked for dispersion and
-    convergence, which look at an agent's most likely trajectory alone."""
+    """Those that are challenge pairs at this frame. The others are requested for dispersion and convergence,
+    which need an agent's most likely trajectory only."""
 
 
 @dataclass(frozen=True)
-class PlannedScene:
-    """A recorded scene and the calls about it."""
+class PlannedScene(ScenePairs):
+    """A recorded scene with its pairs and calls."""
 
-    record: SceneRecord
-    pairs: Sequence[Pair]
-    """The challenge's that are asked for, ordered by frame, then by track."""
-    first: int
-    """Number of its first pair among those of all scenes."""
     calls: tuple[Call, ...]
     """Ordered by frame."""
 
     @property
     def forecasts(self) -> int:
-        """How many are asked of each model."""
+        """Number of forecasts requested of each model."""
         return sum(len(call.tracks) for call in self.calls)
-
-    def truth(self) -> Floats:
-        """[N, 12, 2], m, ground frame: where the pairs' agents went."""
-        return self._positions(STEPS_AHEAD)
-
-    def origin(self) -> Floats:
-        """[N, 2], m, ground frame: where the pairs' agents are."""
-        return self._positions(np.array(0))
-
-    def stood(self) -> Bools:
-        """[N], whether the pairs' agents stood before now (``model.metrics.standing``)."""
-        return self.record.stood(self.pairs)
-
-    def _positions(self, ahead: Ints) -> Floats:
-        """Where the pairs' agents are so many frames later: [N, ..., 2], m."""
-        tracks = self.record.tracks
-        return np.stack([tracks[pair.track].positions(pair.frame + ahead) for pair in self.pairs])
 
 
 def plan_scenes(
     reader: Reader, split: str, *, consistency: bool = True, limit: int | None = None
 ) -> Iterator[PlannedScene]:
-    """Plans the scenes of a split, in order.
+    """Plan the scenes of a split, in order.
 
     Args:
-        reader: of the data.
-        split: one of the reader's.
-        consistency: also ask for every agent that has pairs, at every frame at which it has a full history.
-        limit: how many of the first pairs; None: all.
+        reader: reader of the data.
+        split: one of the reader's splits.
+        consistency: whether to request also every agent with pairs at every frame of full history.
+        limit: number of pairs, from the first; None: all.
 
     Raises:
-        DataError: the data is bad, or the split has no pairs.
+        DataError: the data is invalid, or the split has no pairs.
     """
-    first = 0
-    for record in reader.scenes(split):
-        check_pairs(record.name, record.tracks, record.pairs)
-        pairs = record.pairs if limit is None else record.pairs[: limit - first]
-        yield PlannedScene(record, pairs, first, tuple(_calls(record, pairs, consistency)))
-        first += len(pairs)
-        if first == limit:
-            return
-    if not first:
-        raise DataError(f"the split {split!r} has no pairs")
+    for scene in split_pairs(reader, split, limit):
+        calls = tuple(_calls(scene.record, scene.pairs, consistency))
+        yield PlannedScene(scene.record, scene.pairs, scene.first, calls)
 
 
 def digest(scenes: Sequence[PlannedScene]) -> str:
-    """What is asked, and of what data, as one hexadecimal number: answers of another plan have another."""
+    """Return a hexadecimal digest of the calls and their data."""
     whole = hashlib.sha256()
     for scene in scenes:
         whole.update(repr((scene.record.name, scene.first, scene.pairs, scene.calls)).encode())
@@ -104,7 +75,7 @@ def digest(scenes: Sequence[PlannedScene]) -> str:
 
 
 def full_history(frames: Ints) -> Ints:
-    """Those of a track's frames before which, too, it was seen without a break for a full history.
+    """Return the frames of a track at which it has an unbroken full history.
 
     Args:
         frames: [F], ascending.
@@ -119,10 +90,10 @@ def _calls(record: SceneRecord, pairs: Sequence[Pair], consistency: bool) -> Ite
     due: dict[int, set[int]] = defaultdict(set)
     for pair in pairs:
         due[pair.frame].add(pair.track)
-    asked = {frame: set(tracks) for frame, tracks in due.items()}
+    requested = {frame: set(tracks) for frame, tracks in due.items()}
     if consistency:
         for track in {pair.track for pair in pairs}:
             for frame in full_history(record.tracks[track].frames).tolist():
-                asked.setdefault(frame, set()).add(track)
-    for frame in sorted(asked):
-        yield Call(frame, tuple(sorted(asked[frame])), frozenset(due.get(frame, ())))
+                requested.setdefault(frame, set()).add(track)
+    for frame in sorted(requested):
+        yield Call(frame, tuple(sorted(requested[frame])), frozenset(due.get(frame, ())))

@@ -1,4 +1,4 @@
-"""Requests out of recorded scenes, as a driving stack would send them."""
+"""Requests from recorded scenes, as a driving stack would send them."""
 
 import numpy as np
 
@@ -12,20 +12,20 @@ from model.scenes.observations import Observations
 from model.scenes.scene import STEP_SECONDS, Raster
 
 REACH_M = 74.0
-"""m around an agent that are sent of the map; a far patch reaches 71 m, and where recorded rasters end, 75 m
-beyond the tracks, tells where nobody goes."""
+"""Range of the map sent around an agent, m. A far patch reaches 71 m. Recorded rasters end 75 m beyond the
+tracks; a larger range would reveal where no agent goes."""
 
 
 class SceneRequests:
-    """Makes the requests of one scene.
+    """Requests of one scene.
 
-    By the causal protocol agents are sent with positions and headings, as a stack without derivatives has
-    them; by the paper protocol also with velocities, accelerations and heading rates by central differences.
+    By the causal protocol agents are sent with positions and headings, as by a stack without derivatives; by
+    the paper protocol also with velocities, accelerations and heading rates by central differences.
 
     Args:
-        scene: what is asked.
-        protocol: of the inputs.
-        history_frames: how many frames of history the hungriest of the models uses.
+        scene: the planned scene.
+        protocol: protocol of the inputs.
+        history_frames: frames of history, the maximum over the models.
     """
 
     def __init__(self, scene: PlannedScene, protocol: Protocol, history_frames: int) -> None:
@@ -34,9 +34,9 @@ class SceneRequests:
         self._derived = protocol is Protocol.PAPER
 
     def request(self, call: Call) -> PredictRequest:
-        """The request of a call; it names no model yet.
+        """Return the request of a call, without the model.
 
-        All agents that are there go along as context; the map is that around the call's agents.
+        It holds all present agents as context, and the map around the call's agents.
         """
         observations, tracks = self._frames.observations(call.frame)
         wanted = set(call.tracks)
@@ -50,7 +50,7 @@ class SceneRequests:
         return predict_request(
             time=call.frame * STEP_SECONDS,
             agents=agents,
-            merge=False,  # The challenge ranks the model's own modes, and the judge merges by itself
+            merge=False,  # the metrics need the model's own modes, and merge them themselves
             raster=crop(self._scene.record.raster, around),
         )
 
@@ -71,14 +71,14 @@ class SceneRequests:
 
 
 def crop(raster: Raster, around: Floats) -> SceneRaster:
-    """The part of a map that some agents can see, on the same pixels.
+    """Return the part of a map that some agents can see, on the same pixel grid.
 
-    Off the map it is one empty pixel: for models of the ground frame nothing is driveable beyond its edge,
-    while of no map at all they would know nothing.
+    Off the map this is one empty pixel: beyond the edge of a map nothing is driveable, while without a map
+    models would treat it as unknown.
 
     Args:
-        raster: of the scene.
-        around: [N, 2], m, ground frame: where the agents are.
+        raster: map of the scene.
+        around: [N, 2], m, ground frame, positions of the agents.
     """
     scale = raster.pixels_per_meter
     size = np.array(raster.layers.shape[1:])

@@ -1,26 +1,24 @@
-"""What a benchmark found, as it is written to ``results.json``."""
+"""Results of a benchmark: ``results.json``, and the figures of each pair in ``instances.npz``."""
 
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 from zipfile import BadZipFile
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from benchmark import BenchmarkError
-from benchmark.files import replace_text, replacing
-from model.arrays import Floats
-from model.evaluation.results import finite
+from benchmark.errors import BenchmarkError
+from model.arrays import Floats, Ints
+from model.evaluation.results import RESULTS_FILE, ModelResult, Results, replacing
 from model.forecaster import Protocol
 
-RESULTS_FILE = "results.json"
-INSTANCES_FILE = "instances.npz"
-"""Figures of each pair, for comparisons pair by pair."""
-PER_INSTANCE = (
+INSTANCES_FILE: Final = "instances.npz"
+"""Figures of each pair, for paired comparisons of two runs."""
+PER_INSTANCE: Final = (
     "ade_ml_6s_m",
     "fde_ml_6s_m",
     "min_ade_5_m",
@@ -32,152 +30,156 @@ PER_INSTANCE = (
     "off_road_ml",
     "fde_f_6s_m",
 )
-"""The figures that ``instances.npz`` holds, as ``<name@version>/<figure>`` [pairs], NaN where missing."""
+"""Figures in ``instances.npz``, as ``<name@version>/<figure>`` [pairs], NaN where missing."""
+_SCENES: Final = "scenes"
+"""Entry of ``instances.npz``: [pairs], the index of each pair's scene."""
 
 
 @dataclass(frozen=True)
 class Latency:
-    """Of the calls to one model; s. The client's own queue of senders does not count."""
+    """Durations of the calls to one model; the client's own queue of senders does not count."""
 
     calls: int
     p50_s: float
     p90_s: float
     p99_s: float
     queue_p50_s: float
-    """Of the server's own account: before the model started."""
+    """Time before the model started, as the server reports it."""
     inference_p50_s: float
-    """Inside the model."""
+    """Time inside the model, as the server reports it."""
     batch_agents_mean: float
-    """Agents in the batches that calls rode in."""
+    """Mean number of agents in the batches."""
 
 
-@dataclass(frozen=True)
-class ModelResult:
-    """One model, or the physics oracle."""
+@dataclass(frozen=True, kw_only=True)
+class BenchmarkModelResult(ModelResult):
+    """Figures of one model, or of the physics oracle.
 
-    name: str
-    version: str
-    """Empty for the oracle."""
+    Besides the means over the pairs, ``metrics`` holds means over instants, by the names of
+    ``evaluate.CONSISTENCY``, and ``fde_hardest_1_m`` … ``fde_hardest_3_m`` over the hardest per cent of the
+    pairs, with ``fde_hardest_all_m``.
+    """
+
     protocol: str
-    """Of the states that it was trained on: "causal", "paper"; "any" where nothing was learned."""
-    trained_on: str
+    """Protocol of the training data: "causal", "paper"; "any" where nothing was learned."""
     statuses: Mapping[str, int]
-    """How many of the pairs came out how: statuses of the contract, and MISSING."""
-    metrics: Mapping[str, float]
-    """Means over the pairs, by the names of ``model.metrics.evaluate``; over instants, by those of
-    ``benchmark.consistency``; ``fde_hardest_1_m`` … ``fde_hardest_3_m`` over the hardest per cent, with
-    ``fde_hardest_all_m``; NaN where unknown."""
+    """Number of pairs by status of the contract, or MISSING."""
     instants: int = 0
-    """Over how many the means of dispersion and convergence are."""
+    """Number of instants in the means of dispersion and convergence."""
     lost: int = 0
-    """Forecasts that were asked for dispersion and convergence alone, and did not come."""
+    """Missing forecasts among those requested for dispersion and convergence only."""
     latency: Latency | None = None
 
     @property
-    def key(self) -> str:
-        """``name@version``; the oracle's name."""
-        return f"{self.name}@{self.version}" if self.version else self.name
-
-    @property
     def missing(self) -> int:
-        """Forecasts that did not come."""
+        """Number of missing forecasts."""
         return self.statuses.get("MISSING", 0) + self.statuses.get("INVALID", 0) + self.lost
 
     @property
     def fallbacks(self) -> int:
-        """Pairs whose forecast another model made."""
+        """Number of pairs that another model forecast."""
         return self.statuses.get("FALLBACK", 0)
 
+    def label(self, inputs: Protocol) -> str:
+        """Return the model's name in tables, with its training protocol if it differs, and its fallbacks."""
+        notes = [] if self.protocol in {"any", inputs.value} else [f"trained {self.protocol}"]
+        if self.fallbacks:
+            notes.append(f"{self.fallbacks} of {sum(self.statuses.values())} by a fallback")
+        return f"{self.key} ({', '.join(notes)})" if notes else self.key
 
-@dataclass(frozen=True)
-class Results:
-    """All models on the same pairs."""
 
-    data: str
-    """Kind of the data set."""
-    split: str
-    protocol: Protocol
-    """Of the inputs."""
-    pairs: int
-    limit: int | None
-    """Only so many of the first pairs were asked for; None: all."""
+@dataclass(frozen=True, kw_only=True)
+class BenchmarkResults(Results):
+    """Results of a benchmark."""
+
+    models: tuple[BenchmarkModelResult, ...]
     consistency: bool
-    """Whether dispersion and convergence were asked for."""
-    samples: int
-    """Trajectories drawn for each pair (ADE-f, FDE-f, OffR-f)."""
-    draws: int
-    """Positions drawn at each step for calibration."""
+    """Whether forecasts for dispersion and convergence were requested."""
     seed: int
     plan: str
-    """Digest of what was asked, and of what data."""
+    """Digest of the requested forecasts and their data."""
     endpoint: str
     concurrency: int
-    """Calls on their way at once, when it was last asked; 0: unknown."""
+    """Number of concurrent calls of the last replay; 0: unknown."""
     version: str
-    """Of this program."""
-    models: tuple[ModelResult, ...]
+    """Version of this program."""
     refusals: tuple[str, ...] = field(default=())
     """Calls that the endpoint refused, in words."""
 
     def statement(self) -> str:
-        """What the figures are of, in words; belongs to every table."""
-        pairs = f"{self.pairs} pairs" if self.limit is None else f"the first {self.pairs} pairs only"
-        return f"{self.protocol.value} protocol, {self.data} split {self.split}, {pairs}, seed {self.seed}"
+        """Return what the figures are computed on, in words; every table carries it."""
+        return f"{super().statement()}, seed {self.seed}"
 
     @property
     def missing(self) -> int:
-        """Forecasts of any model that did not come."""
+        """Number of missing forecasts of all models."""
         return sum(model.missing for model in self.models)
 
-    def write(self, folder: Path) -> None:
-        """Writes ``results.json``; null for what is not finite.
-
-        Raises:
-            OSError: it cannot be written.
-        """
-        text = json.dumps(finite(asdict(self)), indent=2, allow_nan=False) + "\n"
-        replace_text(folder / RESULTS_FILE, text)
-
     @classmethod
-    def read(cls, folder: Path) -> "Results":
-        """Reads what ``write`` wrote.
+    def read(cls, folder: Path) -> "BenchmarkResults":
+        """Read the ``results.json`` of a benchmark.
 
         Raises:
-            BenchmarkError: it is not there, or not of this form.
+            BenchmarkError: the file is missing or invalid.
         """
         file = folder / RESULTS_FILE
         try:
-            return TypeAdapter(cls).validate_python(_nan(json.loads(file.read_text(encoding="utf-8"))))
+            return TypeAdapter(cls).validate_python(_with_nan(json.loads(file.read_text(encoding="utf-8"))))
         except OSError as error:
             raise BenchmarkError(f"{file}: cannot be read: {error.strerror}") from error
         except (ValueError, AttributeError, TypeError, ValidationError) as error:
             raise BenchmarkError(f"{file}: not a benchmark's results: {error}") from error
 
 
-def write_instances(folder: Path, figures: Mapping[str, Floats]) -> None:
-    """Writes ``instances.npz``: see ``PER_INSTANCE``."""
-    with replacing(folder / INSTANCES_FILE) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, **figures)  # type: ignore[arg-type]
+@dataclass(frozen=True)
+class Instances:
+    """Figures of each pair of a run."""
+
+    figures: Mapping[str, Floats]
+    """[pairs] by ``<name@version>/<figure>``, NaN where missing; see ``PER_INSTANCE``."""
+    scenes: Ints | None = None
+    """[pairs], index of each pair's scene; None in files of older versions."""
+
+    def write(self, folder: Path) -> None:
+        """Write ``instances.npz``.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        arrays: dict[str, Any] = dict(self.figures)
+        if self.scenes is not None:
+            arrays[_SCENES] = self.scenes
+        with replacing(folder / INSTANCES_FILE) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, **arrays)
+
+    @classmethod
+    def read(cls, folder: Path, pairs: int) -> "Instances":
+        """Read ``instances.npz``; without such a file, there are no figures.
+
+        Args:
+            folder: folder of a run.
+            pairs: number of pairs of the run.
+
+        Raises:
+            BenchmarkError: the file is damaged, or holds another number of pairs.
+        """
+        file = folder / INSTANCES_FILE
+        if not file.is_file():
+            return cls({})
+        try:
+            with file.open("rb") as opened, np.load(opened, allow_pickle=False) as arrays:
+                found = {name: arrays[name] for name in arrays.files}
+        except (OSError, ValueError, BadZipFile) as error:
+            raise BenchmarkError(f"{file}: cannot be read: {error}") from error
+        for name, values in found.items():
+            if values.shape != (pairs,):
+                raise BenchmarkError(f"{file}: {name} is of {list(values.shape)}, not of {pairs} pairs")
+        scenes = found.pop(_SCENES, None)
+        return cls(found, scenes)
 
 
-def read_instances(folder: Path) -> dict[str, Floats]:
-    """Reads what ``write_instances`` wrote; nothing where there is no such file.
-
-    Raises:
-        BenchmarkError: it is damaged.
-    """
-    file = folder / INSTANCES_FILE
-    if not file.is_file():
-        return {}
-    try:
-        with file.open("rb") as opened, np.load(opened, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
-    except (OSError, ValueError, BadZipFile) as error:
-        raise BenchmarkError(f"{file}: cannot be read: {error}") from error
-
-
-def _nan(read: Any) -> Any:
-    """Figures that are null are NaN again."""
-    for model in read.get("models", []):
+def _with_nan(document: Any) -> Any:
+    """Return the document with null metrics as NaN."""
+    for model in document.get("models", []):
         model["metrics"] = {k: math.nan if v is None else v for k, v in model.get("metrics", {}).items()}
-    return read
+    return document

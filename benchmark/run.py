@@ -1,152 +1,233 @@
-"""A whole benchmark: what ``cab-forecast benchmark`` does."""
+"""A whole benchmark: replay, evaluation, and all files of its results."""
 
-from collections.abc import Callable, Mapping, Sequence
+import asyncio
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
+from itertools import chain
 from pathlib import Path
+from typing import Final
 
-from benchmark import BenchmarkError
 from benchmark.answers import read_answers
 from benchmark.archive import Archive
-from benchmark.hard import HardCase, hard_case, shown_cases
-from benchmark.judge import Judged, judge
-from benchmark.models import choose
+from benchmark.errors import BenchmarkError
+from benchmark.evaluate import Evaluated, evaluate
+from benchmark.hard_cases import HardCase, hard_case, shown_cases
+from benchmark.in_process import replay_in_process
+from benchmark.models import describe, key, select, unfit
 from benchmark.plan import PlannedScene, digest, plan_scenes
-from benchmark.replay import Replay, Replayed
-from benchmark.results import Results
-from benchmark.score import Judging
+from benchmark.prometheus_rules import RULES_FILE, rules
+from benchmark.replay import RETRIES, Replay, Replayed
+from benchmark.results import BenchmarkResults
+from benchmark.submission import submission_entries, write_submission
+from benchmark.tables import markdown
 from cab.forecast.v1.model_service_pb2 import Model
 from cab_forecast import AsyncClient, ForecastError
 from model.arrays import Floats
 from model.data.scenes import Reader
-from model.forecaster import Protocol
+from model.evaluation.results import TABLES_FILE, replace_text
+from model.forecaster import Forecaster, Protocol
+from model.metrics.pairs import Sampling
+
+IN_PROCESS: Final = "in process"
+"""Name of the endpoint in results without one."""
+_DRAWN: Final = ("cab", "trajectron")
+"""Models whose forecasts of hard cases are drawn; without either, those of the first model."""
+
+
+@dataclass(frozen=True)
+class Endpoint:
+    """A running server."""
+
+    address: str
+    token: str | None = None
+    concurrency: int = 16
+    """Maximum number of concurrent calls."""
+    timeout: float = 60.0
+    """Seconds for a call with its retries; also the time that a lost server is waited for."""
+
+
+class Progress:
+    """Receiver of progress, which ignores it; a subclass may show it."""
+
+    def note(self, text: str) -> None:
+        """Receive a message."""
+
+    @contextmanager
+    def task(self, name: str, total: int | None = None, unit: str = "") -> Iterator[Callable[[int], None]]:
+        """Receive the steps of a task, by a function that is called with their number.
+
+        Args:
+            name: the task in words.
+            total: number of steps; None: unknown.
+            unit: plural of a step.
+        """
+        yield lambda steps: None
+
+
+@dataclass(frozen=True)
+class BenchmarkRun:
+    """Outcome of a benchmark."""
+
+    results: BenchmarkResults
+    files: tuple[Path, ...]
+    """Report and submissions; beside them are the files that every run has."""
 
 
 @dataclass(frozen=True)
 class Benchmark:
-    """What is asked of an endpoint, and how its answers are judged."""
+    """Data of a benchmark, and how it is evaluated."""
 
     kind: str
-    """Of the data set."""
+    """Kind of the data set."""
     reader: Reader
     split: str
     protocol: Protocol
-    """Of the inputs."""
+    """Protocol of the inputs."""
     folder: Path
-    """Of the answers."""
-    judging: Judging
+    """Folder of the saved answers."""
+    sampling: Sampling
+    """Number of random draws."""
+    consistency: bool = True
+    """Whether to request forecasts for dispersion and convergence, too."""
     limit: int | None = None
-    """How many of the first pairs; None: all."""
+    """Number of pairs, from the first; None: all."""
 
     @cached_property
     def scenes(self) -> list[PlannedScene]:
-        """All that is asked.
+        """Planned scenes.
 
         Raises:
-            DataError: the data is bad, or the split is unknown or has no pairs.
+            DataError: the data is invalid, the split unknown, or without pairs.
         """
-        return list(
-            plan_scenes(self.reader, self.split, consistency=self.judging.consistency, limit=self.limit)
-        )
+        return list(plan_scenes(self.reader, self.split, consistency=self.consistency, limit=self.limit))
 
     @cached_property
     def plan(self) -> str:
-        """Digest of what is asked."""
+        """Digest of the planned scenes."""
         return digest(self.scenes)
 
     @property
     def pairs(self) -> int:
-        """How many pairs there are."""
+        """Number of pairs."""
         return sum(len(scene.pairs) for scene in self.scenes)
 
-    def replay(self, models: Mapping[str, Model], concurrency: int, timeout: float) -> Replay:
-        """The calls to an endpoint; arguments as ``Replay``."""
-        return Replay(self.scenes, models, self.protocol, concurrency, timeout)
+    @property
+    def forecasts(self) -> int:
+        """Number of forecasts requested of each model."""
+        return sum(scene.forecasts for scene in self.scenes)
 
-    async def ask(
-        self, client: AsyncClient, endpoint: str, replay: Replay, tick: Callable[[int], None]
+    async def replay(
+        self,
+        client: AsyncClient,
+        endpoint: Endpoint,
+        models: Mapping[str, Model],
+        tick: Callable[[int], None] = lambda forecasts: None,
     ) -> Replayed:
-        """Asks whatever has no answer yet.
+        """Request all forecasts without a saved answer from an endpoint.
 
         Args:
-            client: of the endpoint.
-            endpoint: its name, for the record.
-            replay: of this benchmark.
-            tick: told of every call how many forecasts it brought.
+            client: client of the endpoint.
+            endpoint: the endpoint.
+            models: models by ``name@version``.
+            tick: called with the number of forecasts of every call, saved ones included.
 
         Raises:
-            BenchmarkError: the folder has answers of something else, or the endpoint does not answer.
+            BenchmarkError: the folder holds answers of another run, or the endpoint does not answer.
         """
-        with Archive(self.folder) as archive:
-            archive.bind(self._facts())
-            archive.note("endpoint", endpoint)
-            archive.note("concurrency", str(replay.concurrency))
-            for name, model in replay.models.items():
-                archive.register(name, model)
-            return await replay.run(client, archive, tick)
+        calls = Replay(self.scenes, models, self.protocol, endpoint.concurrency, endpoint.timeout)
+        with self._bound_archive(endpoint.address, endpoint.concurrency, models) as archive:
+            return await calls.run(client, archive, tick)
+
+    def replay_in_process(
+        self,
+        forecasters: Mapping[str, Forecaster],
+        tick: Callable[[int], None] = lambda forecasts: None,
+    ) -> Replayed:
+        """Make all forecasts without a saved answer in this process.
+
+        Args:
+            forecasters: forecasters by ``name@version``.
+            tick: called with the number of forecasts of every call, saved ones included.
+
+        Raises:
+            BenchmarkError: the folder holds answers of another run.
+        """
+        models = {name: describe(one.info) for name, one in forecasters.items()}
+        with self._bound_archive(IN_PROCESS, 1, models) as archive:
+            return replay_in_process(self.scenes, forecasters, self.protocol, archive, tick)
 
     def saved_models(self, names: Sequence[str] = ()) -> dict[str, Model]:
-        """Models whose answers are saved, by ``name@version``.
+        """Return the models with saved answers, by ``name@version``.
 
         Args:
-            names: ``name`` or ``name@version`` of those that are wanted; empty: all.
+            names: ``name`` or ``name@version`` of the models to keep; empty: all.
 
         Raises:
-            BenchmarkError: there are no answers, or to something else, or none of a name.
+            BenchmarkError: there are no answers, those of another run, or none of a name.
         """
         with Archive(self.folder, read_only=True) as archive:
-            archive.check(self._facts())
+            archive.check(self._properties())
             saved = archive.models()
         if not saved:
             raise BenchmarkError(f"{self.folder}: there are no saved answers")
-        return choose(list(saved.values()), self.protocol, names, str(self.folder)) if names else saved
+        return select(list(saved.values()), self.protocol, names, str(self.folder)) if names else saved
 
-    def judge(
-        self, models: Mapping[str, Model], processes: int, tick: Callable[[int], None]
-    ) -> tuple[Results, Judged]:
-        """Judges the saved answers.
+    def evaluate(
+        self,
+        models: Mapping[str, Model],
+        processes: int = 1,
+        tick: Callable[[int], None] = lambda pairs: None,
+    ) -> tuple[BenchmarkResults, Evaluated]:
+        """Evaluate the saved answers.
 
         Args:
-            models: by ``name@version``.
-            processes: that judge.
-            tick: told how many pairs are done.
+            models: models by ``name@version``.
+            processes: number of processes.
+            tick: called after each scene with its number of pairs.
 
         Returns:
-            All figures; and those of each pair.
+            The results; and the evaluation with the figures of each pair.
+
+        Raises:
+            BenchmarkError: an answer does not fit its call, or a process died.
         """
-        judged = judge(self.folder, self.scenes, models, self.judging, processes, tick)
+        evaluated = evaluate(
+            self.folder, self.scenes, models, self.sampling, self.consistency, processes, tick
+        )
         with Archive(self.folder, read_only=True) as archive:
-            facts, refusals = archive.facts(), archive.refusals()
-        results = Results(
+            properties, refusals = archive.facts(), archive.refusals()
+        results = BenchmarkResults(
             data=self.kind,
             split=self.split,
             protocol=self.protocol,
             pairs=self.pairs,
             limit=None if self.limit is None or self.limit > self.pairs else self.limit,
-            consistency=self.judging.consistency,
-            samples=self.judging.samples,
-            draws=self.judging.draws,
-            seed=self.judging.seed,
+            consistency=self.consistency,
+            samples=self.sampling.samples,
+            draws=self.sampling.draws,
+            seed=self.sampling.seed,
             plan=self.plan,
-            endpoint=facts.get("endpoint", ""),
-            concurrency=int(facts.get("concurrency", 0)),
+            endpoint=properties.get("endpoint", ""),
+            concurrency=int(properties.get("concurrency", 0)),
             version=version("cab-forecast"),
-            models=judged.models,
+            models=evaluated.models,
             refusals=tuple(
                 f"{one.model}, {one.scene}, frame {one.frame}: {one.why}"
                 for one in refusals
                 if one.model in models
             ),
         )
-        return results, judged
+        return results, evaluated
 
     def hard_cases(self, models: Sequence[str], mismatch_m: Floats) -> list[HardCase]:
-        """The hardest pairs with what some models made of them, for pictures.
+        """Return the hardest pairs with the forecasts of some models.
 
         Args:
-            models: ``name@version``.
-            mismatch_m: [pairs], m, of the Kalman filter.
+            models: ``name@version`` of the models.
+            mismatch_m: [pairs], m, FDE of the Kalman filter.
         """
         cases = []
         with Archive(self.folder, read_only=True) as archive:
@@ -160,25 +241,165 @@ class Benchmark:
                 cases.append(hard_case(scene, number, float(mismatch_m[scene.first + number]), mixtures))
         return cases
 
-    def _facts(self) -> dict[str, str]:
-        """What answers must be to."""
+    @contextmanager
+    def _bound_archive(
+        self, endpoint: str, concurrency: int, models: Mapping[str, Model]
+    ) -> Iterator[Archive]:
+        with Archive(self.folder) as archive:
+            archive.bind(self._properties())
+            archive.note("endpoint", endpoint)
+            archive.note("concurrency", str(concurrency))
+            for name, model in models.items():
+                archive.register(name, model)
+            yield archive
+
+    def _properties(self) -> dict[str, str]:
+        """Return the properties that answers of this run have in common."""
         return {
             "data": self.kind,
             "split": self.split,
             "protocol": self.protocol.value,
             "limit": str(self.limit or "none"),
-            "consistency": "yes" if self.judging.consistency else "no",
+            "consistency": "yes" if self.consistency else "no",
             "plan": self.plan[:16],
         }
 
 
-async def listed_models(client: AsyncClient) -> list[Model]:
-    """What the endpoint lists.
+def run_benchmark(
+    benchmark: Benchmark,
+    source: Endpoint | Sequence[Forecaster] | None,
+    out: Path,
+    *,
+    names: Sequence[str] = (),
+    processes: int = 1,
+    progress: Progress | None = None,
+) -> BenchmarkRun:
+    """Replay the data, evaluate the answers and write the results.
+
+    ``out`` then holds ``results.json``, ``tables.md``, ``instances.npz``, ``report.html`` (with the extra
+    "plot"), ``benchmark.yml`` (by the causal protocol, without a limit), and a submission for each model if
+    the data has the challenge's tokens.
+
+    Args:
+        benchmark: the data, and how it is evaluated.
+        source: source of the answers: an endpoint, forecasters of this process, or None: the saved answers.
+            An endpoint starts an event loop, so that none may be running in this thread.
+        out: output folder, created if missing.
+        names: ``name`` or ``name@version`` of the models; empty: all that fit the protocol.
+        processes: number of processes that evaluate.
+        progress: receiver of progress; None: none.
 
     Raises:
-        BenchmarkError: it does not answer.
+        BenchmarkError: the benchmark cannot go on; the text says why.
+        DataError: the data is invalid.
+        OSError: a file cannot be written.
+    """
+    progress = progress or Progress()
+    with progress.task("reading the data"):
+        forecasts = benchmark.forecasts
+    progress.note(f"{benchmark.pairs} pairs, {forecasts} forecasts of each model")
+    if source is None:
+        models = benchmark.saved_models(names)
+    elif isinstance(source, Endpoint):
+        models = asyncio.run(_replay(benchmark, source, names, progress))
+    else:
+        models = _replay_in_process(benchmark, source, names, progress)
+    with progress.task("evaluating", benchmark.pairs, "pairs") as tick:
+        results, evaluated = benchmark.evaluate(models, processes, tick)
+    out.mkdir(parents=True, exist_ok=True)
+    results.write(out)
+    evaluated.instances.write(out)
+    replace_text(out / TABLES_FILE, markdown(results))
+    if text := rules(results):
+        replace_text(out / RULES_FILE, text)
+    page = _write_page(benchmark, results, evaluated.mismatch_m, out, progress)
+    submissions = _write_submissions(benchmark, models, out, progress)
+    return BenchmarkRun(results, (*([] if page is None else [page]), *submissions))
+
+
+async def listed_models(client: AsyncClient) -> list[Model]:
+    """Return the models of an endpoint.
+
+    Raises:
+        BenchmarkError: the endpoint does not answer.
     """
     try:
         return await client.list_models()
     except ForecastError as error:
         raise BenchmarkError(f"the endpoint does not answer: {error}") from error
+
+
+async def _replay(
+    benchmark: Benchmark, endpoint: Endpoint, names: Sequence[str], progress: Progress
+) -> dict[str, Model]:
+    async with AsyncClient(endpoint.address, endpoint.token, endpoint.timeout, RETRIES) as client:
+        models = _selected(await listed_models(client), benchmark.protocol, names, progress, "the endpoint")
+        total = benchmark.forecasts * len(models)
+        with progress.task(f"requesting {len(models)} models", total, "forecasts") as tick:
+            replayed = await benchmark.replay(client, endpoint, models, tick)
+    _note_rate(replayed, progress)
+    return models
+
+
+def _replay_in_process(
+    benchmark: Benchmark, forecasters: Sequence[Forecaster], names: Sequence[str], progress: Progress
+) -> dict[str, Model]:
+    by_key = {one.info.full_name: one for one in forecasters}
+    listed = [describe(one.info) for one in forecasters]
+    models = _selected(listed, benchmark.protocol, names, progress, "this process")
+    total = benchmark.forecasts * len(models)
+    with progress.task(f"running {len(models)} models", total, "forecasts") as tick:
+        replayed = benchmark.replay_in_process({name: by_key[name] for name in models}, tick)
+    _note_rate(replayed, progress)
+    return models
+
+
+def _selected(
+    listed: Sequence[Model], protocol: Protocol, names: Sequence[str], progress: Progress, place: str
+) -> dict[str, Model]:
+    models = select(listed, protocol, names, place)
+    for one in listed:
+        if not names and (why := unfit(one, protocol)):
+            progress.note(f"left out: {key(one)}: {why}")
+    return models
+
+
+def _note_rate(replayed: Replayed, progress: Progress) -> None:
+    rate = replayed.requested / replayed.seconds if replayed.seconds else 0.0
+    progress.note(
+        f"requested {replayed.requested} forecasts in {replayed.seconds:.1f} s ({rate:.0f} forecasts/s)"
+    )
+
+
+def _write_submissions(
+    benchmark: Benchmark, models: Iterable[str], out: Path, progress: Progress
+) -> Iterator[Path]:
+    """Write a submission for each model that answered all pairs, if the data has the challenge's tokens."""
+    if not all(pair.token for scene in benchmark.scenes for pair in scene.pairs):
+        return
+    with Archive(benchmark.folder, read_only=True) as archive:
+        for model in models:
+            file = out / f"submission-{model}.json"
+            entries = (
+                submission_entries(scene, read_answers(archive, model, scene)) for scene in benchmark.scenes
+            )
+            try:
+                write_submission(chain.from_iterable(entries), file)
+            except BenchmarkError as error:
+                progress.note(f"no submission of {model}: {error}")
+            else:
+                yield file
+
+
+def _write_page(
+    benchmark: Benchmark, results: BenchmarkResults, mismatch_m: Floats | None, out: Path, progress: Progress
+) -> Path | None:
+    try:
+        from benchmark.report.page import write_page  # noqa: PLC0415 (an extra)
+    except ImportError as error:
+        progress.note(f"no report.html: {error} (pip install 'cab-forecast[plot]')")
+        return None
+    called = [model for model in results.models if model.version]
+    drawn = [model.key for model in called if model.name in _DRAWN] or [model.key for model in called[:1]]
+    cases = [] if mismatch_m is None else benchmark.hard_cases(drawn, mismatch_m)
+    return write_page(results, cases, out)

@@ -1,8 +1,8 @@
-"""The nuScenes prediction challenge's submission, out of saved answers.
+"""Submission to the nuScenes prediction challenge.
 
-A JSON list with one entry a pair, as nuscenes-devkit reads it (``eval/prediction/data_classes.py``). Its
-metrics rank the modes by probability, so entries are written such that it ranks them as
-``model.metrics.multimodal`` does, and finds the same figures.
+A JSON list with one entry per pair, as nuscenes-devkit reads it (``eval/prediction/data_classes.py``). The
+devkit ranks modes by probability; entries are written so that it ranks them as ``model.metrics.multimodal``
+does and computes the same figures.
 """
 
 import json
@@ -12,16 +12,16 @@ from typing import Final, TypedDict
 
 import numpy as np
 
-from benchmark import BenchmarkError
 from benchmark.answers import SceneAnswers
-from benchmark.files import replacing
+from benchmark.errors import BenchmarkError
 from benchmark.plan import PlannedScene
 from model.arrays import Bools, Floats
 from model.data.checks import FUTURE_STEPS
+from model.evaluation.results import replacing
 from model.metrics.multimodal import by_probability
 
 MAX_MODES: Final = 25
-"""Of an entry; the devkit refuses more."""
+"""Maximum number of modes of an entry; the devkit refuses more."""
 
 
 class Entry(TypedDict):
@@ -30,22 +30,22 @@ class Entry(TypedDict):
     instance: str
     sample: str
     prediction: list[list[list[float]]]
-    """[modes][12][2], m, ground frame; the likeliest mode first."""
+    """[modes][12][2], m, ground frame; the most likely mode first."""
     probabilities: list[float]
     """[modes], strictly falling; their sum is 1."""
 
 
 def submission_entries(scene: PlannedScene, answers: SceneAnswers) -> list[Entry]:
-    """Entries of a scene, in the order of its pairs.
+    """Return the entries of a scene, in the order of its pairs.
 
-    Of more than ``MAX_MODES`` modes the likeliest stay, and get the others' probability in proportion.
+    Of more than ``MAX_MODES`` modes the most likely are kept, and their probabilities normalised.
 
     Args:
-        scene: what was asked.
-        answers: of one model.
+        scene: the planned scene.
+        answers: answers of one model.
 
     Raises:
-        BenchmarkError: the data has no tokens, a pair has no forecast, or one that cannot be submitted.
+        BenchmarkError: the data has no tokens, a pair has no forecast, or a forecast cannot be submitted.
     """
     where = scene.record.name
     if not all(pair.token for pair in scene.pairs):
@@ -67,10 +67,10 @@ def submission_entries(scene: PlannedScene, answers: SceneAnswers) -> list[Entry
     if not (np.isfinite(modes).all() and np.isfinite(probabilities).all()):
         raise BenchmarkError(f"{where}: there are forecasts that are not finite")
     order = by_probability(probabilities)
-    said = ~_padding(modes, probabilities)
+    real = ~_padding(modes, probabilities)
     entries = []
     for row, pair in enumerate(scene.pairs):
-        kept = order[row][said[row][order[row]]][:MAX_MODES]
+        kept = order[row][real[row][order[row]]][:MAX_MODES]
         instance, _, sample = pair.token.partition("_")
         entries.append(
             Entry(
@@ -84,14 +84,14 @@ def submission_entries(scene: PlannedScene, answers: SceneAnswers) -> list[Entry
 
 
 def write_submission(entries: Iterable[Entry], file: Path) -> None:
-    """Writes a submission, one entry a line; a file of that name stays as it was until all is written.
+    """Write a submission, one entry per line; an existing file is replaced only at the end.
 
     Args:
-        entries: of all scenes; taken one by one, as all together may be large.
-        file: to write.
+        entries: entries of all scenes, consumed one by one to save memory.
+        file: the output file.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     with replacing(file) as temporary, temporary.open("w", encoding="utf-8") as out:
         out.write("[")
@@ -101,8 +101,11 @@ def write_submission(entries: Iterable[Entry], file: Path) -> None:
 
 
 def _padding(modes: Floats, probabilities: Floats) -> Bools:
-    """[N, K], modes that nobody said: ``read_answers`` repeats the first one, with no weight, where another
-    pair of the scene has more. The devkit's off-road rate would count each."""
+    """Return the padding modes: [N, K].
+
+    ``read_answers`` pads with copies of the first mode of weight 0 where another pair of the scene has more
+    modes. The devkit's off-road rate would count each.
+    """
     again = (modes == modes[:, :1]).all(axis=(-2, -1))
     again[:, 0] = False
     padding: Bools = again & (probabilities == 0)
@@ -110,8 +113,11 @@ def _padding(modes: Floats, probabilities: Floats) -> Bools:
 
 
 def _falling(probabilities: Floats) -> Floats:
-    """Ranked probabilities [K] with the sum 1, and of equal ones each a rounding error above the next: the
-    devkit leaves ties among more than 16 modes to numpy's version and the processor."""
+    """Return ranked probabilities [K] that sum to 1 and strictly fall.
+
+    Of equal ones each is raised a rounding error above the next: the devkit's order of ties among more than
+    16 modes depends on numpy's version and the processor.
+    """
     falling: Floats = probabilities / probabilities.sum()
     for mode in range(len(falling) - 2, -1, -1):
         falling[mode] = max(falling[mode], np.nextafter(falling[mode + 1], np.inf))

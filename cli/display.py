@@ -19,7 +19,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from model.evaluation.text_tables import Table
+from model.evaluation.tables import Table
 
 _UNBOUNDED = 10_000
 """Columns of the console, more than any table has: the terminal wraps long lines, rich would cut them."""

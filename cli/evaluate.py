@@ -8,7 +8,7 @@ import typer
 from cli.failures import fail
 
 if TYPE_CHECKING:
-    from model.evaluation.results import Results
+    from model.evaluation.results import EvaluationResults
     from model.evaluation.run import Evaluation
 
 
@@ -52,7 +52,7 @@ def evaluate(
     from model.data.scenes import DataError  # noqa: PLC0415
     from model.data.sources import READERS, parse_data, parse_protocol  # noqa: PLC0415
     from model.evaluation.run import Evaluation, write_results  # noqa: PLC0415
-    from model.evaluation.subjects import EvaluationError, choose  # noqa: PLC0415
+    from model.evaluation.selection import EvaluationError, select  # noqa: PLC0415
     from model.evaluation.tables import tables  # noqa: PLC0415
     from service.settings import bundled_models  # noqa: PLC0415
 
@@ -62,10 +62,10 @@ def evaluate(
     try:
         kind, path = parse_data(data)
         inputs = parse_protocol(protocol)
-        subjects = choose(models or bundled_models(), inputs, names)
+        selection = select(models or bundled_models(), inputs, names)
         reader = READERS[kind](path)
         evaluation = Evaluation(
-            subjects, kind, reader, split, inputs, cache or out / "cache", samples, limit, ablate
+            selection, kind, reader, split, inputs, cache or out / "cache", samples, limit, ablate
         )
         results = _run(evaluation)
         write_results(results, out)
@@ -74,7 +74,7 @@ def evaluate(
     show_tables(tables(results), out)
 
 
-def _run(evaluation: "Evaluation") -> "Results":
+def _run(evaluation: "Evaluation") -> "EvaluationResults":
     """Run the evaluation and show its progress."""
     from rich.console import Console  # noqa: PLC0415
 

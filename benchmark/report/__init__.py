@@ -1,1 +1,1 @@
-"""A benchmark's results as one page. Needs matplotlib and jinja2, which the extra "plot" brings."""
+"""Report of a benchmark as one HTML page; needs matplotlib and jinja2, which the extra "plot" installs."""

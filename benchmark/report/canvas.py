@@ -1,4 +1,4 @@
-"""What all pictures of the report share: empty figures, a style for each model, bytes to embed."""
+"""Basics of the report's figures: empty figures, a style for each model, bytes to embed."""
 
 import io
 from collections.abc import Iterable
@@ -13,16 +13,15 @@ from cab_forecast.plot_style import INK
 
 DOTS_PER_INCH = 110
 _PADDING = 0.1
-"""Inches around everything; titles of two lines would be cut with less."""
-_LEAST_WIDTH = 8.0
-"""Inches, for a legend to have room."""
+"""Margin in inches; titles of two lines would be cut with less."""
+_MIN_WIDTH = 8.0
+"""Minimum width in inches, so that a legend fits."""
 FRAME = "#b8bec4"
 GRID = "#e4e7ea"
 REFERENCE = "#6b7480"
-"""What something is held against: the paper's figures, what was said."""
+"""Colour of reference values."""
 
-# Told apart by those, too, who see fewer colours (Okabe and Ito); for their orange and black, which are on
-# every map, brown and violet
+# Safe for colour blindness (Okabe and Ito); brown and violet replace their orange and black, which maps use
 _COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#7f3b08", "#56b4e9", "#6a3d9a")
 _LINES = ("-", (0, (6, 1.5, 1, 1.5)), (0, (1, 1.2)))
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "p", "h", "*", "d")
@@ -30,7 +29,7 @@ _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "p", "h", "*", "d")
 
 @dataclass(frozen=True)
 class Style:
-    """How a model is drawn."""
+    """Line and marker of a model."""
 
     color: str
     line: str | tuple[int, tuple[float, ...]]
@@ -38,7 +37,7 @@ class Style:
 
 
 def styles(models: Iterable[str]) -> dict[str, Style]:
-    """A style for each model, by its place; where colours come again, lines and markers differ."""
+    """Return a style for each model, in order; models of equal colour differ in line and marker."""
     return {
         model: Style(
             _COLORS[place % len(_COLORS)],
@@ -50,33 +49,33 @@ def styles(models: Iterable[str]) -> dict[str, Style]:
 
 
 def plain(text: str) -> str:
-    """A text of somebody's choice, which is no formula."""
+    """Escape a text so that matplotlib reads no formula in it."""
     return text.replace("$", r"\$")
 
 
 def empty(width: float, height: float) -> Figure:
-    """A figure of so many inches that is nobody's but the caller's: no pyplot, no state."""
+    """Return a figure of a size in inches, without pyplot and its global state."""
     layout = ConstrainedLayoutEngine(h_pad=_PADDING, w_pad=_PADDING)
     return Figure(figsize=(width, height), layout=layout, facecolor="white")
 
 
 def grid(panels: int, columns: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
-    """Equal panels in rows.
+    """Return a figure with equal panels in rows.
 
     Args:
-        panels: how many.
-        columns: at most so many in a row.
-        width: of a panel, inches.
-        height: likewise.
+        panels: number of panels.
+        columns: maximum number of panels in a row.
+        width: width of a panel, inches.
+        height: height of a panel, inches.
     """
     columns = min(columns, panels)
     rows = -(-panels // columns)
-    figure = empty(max(width * columns, _LEAST_WIDTH), height * rows + 0.4)
+    figure = empty(max(width * columns, _MIN_WIDTH), height * rows + 0.4)
     return figure, [figure.add_subplot(rows, columns, place + 1) for place in range(panels)]
 
 
 def dress(axes: Axes) -> None:
-    """Quiet frame and grid."""
+    """Draw frame and grid in muted colours."""
     axes.grid(color=GRID, linewidth=0.8)
     axes.set_axisbelow(True)
     axes.tick_params(colors=INK, labelsize=9, length=3)
@@ -86,7 +85,7 @@ def dress(axes: Axes) -> None:
 
 
 def svg(figure: Figure) -> bytes:
-    """As SVG; the same figure is the same bytes."""
+    """Return the figure as SVG; equal figures give equal bytes."""
     file = io.BytesIO()
     with mpl.rc_context({"svg.hashsalt": "cab-forecast"}):
         figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
@@ -94,7 +93,7 @@ def svg(figure: Figure) -> bytes:
 
 
 def png(figure: Figure) -> bytes:
-    """As PNG."""
+    """Return the figure as PNG."""
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=DOTS_PER_INCH)
     return file.getvalue()

@@ -1,4 +1,4 @@
-"""Hard cases as pictures: the map, where the agent came from and went, and what each model forecast."""
+"""Figures of hard cases: the map, the agent's past and future, and the forecasts of each model."""
 
 from collections.abc import Mapping
 
@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from benchmark.hard import CaseForecast, HardCase
+from benchmark.hard_cases import CaseForecast, HardCase
 from benchmark.report.canvas import FRAME, Style, grid, plain
 from benchmark.requests import crop
 from cab.forecast.v1.prediction_service_pb2 import PredictRequest
@@ -16,21 +16,21 @@ from model.arrays import Floats
 
 _PANELS_A_ROW = 5
 _PANEL, _LARGE_PANEL = 2.75, 3.8
-"""Inches; large where few are in a row."""
+"""Size of a panel in inches; large panels if few are in a row."""
 _MARGIN_M = 12.0
-_LEAST_VIEW_M = 50.0
-_FARTHEST_M = 90.0
-"""From the agent: forecasts that go farther leave the picture rather than making everything tiny."""
+_MIN_VIEW_M = 50.0
+_MAX_RANGE_M = 90.0
+"""Range around the agent that the view covers; forecasts may leave it, as they would shrink the rest."""
 _SCALE_M = 10
-_SMALLEST_WEIGHT = 0.005
+_MIN_WEIGHT = 0.005
 
 
 def case_map(case: HardCase, styles: Mapping[str, Style]) -> Figure:
-    """First all models' most likely trajectories, then a panel a model with its modes.
+    """Draw the most likely trajectories of all models, and in a panel for each model its modes.
 
     Args:
-        case: what is drawn.
-        styles: of all models in it, by ``name@version``.
+        case: the hard case.
+        styles: styles of its models, by ``name@version``.
     """
     count = 1 + len(case.forecasts)
     size = _PANEL if count >= _PANELS_A_ROW else _LARGE_PANEL
@@ -41,31 +41,31 @@ def case_map(case: HardCase, styles: Mapping[str, Style]) -> Figure:
         _ground(axes, request, low, high)
         _agent(axes, case)
     for key, forecast in case.forecasts.items():
-        _likeliest(panels[0], case, forecast, styles[key])
+        _most_likely(panels[0], case, forecast, styles[key])
     panels[0].set_title("all, most likely", fontsize=9, color=INK)
     _scale(panels[0], low, high)
     for axes, (key, forecast) in zip(panels[1:], case.forecasts.items(), strict=True):
         _modes(axes, case, forecast, styles[key])
-        _likeliest(axes, case, forecast, styles[key])
+        _most_likely(axes, case, forecast, styles[key])
         title = f"{plain(key)}\nFDE {forecast.fde_6s_m:.1f} m"
         axes.set_title(title, fontsize=8.5, color=INK)
     return figure
 
 
 def _view(case: HardCase) -> tuple[Floats, Floats]:
-    """Lower left and upper right of a square: [2] each, m."""
+    """Return lower left and upper right of a square view: [2] each, m."""
     now = case.history[-1]
-    paths = [forecast.likeliest for forecast in case.forecasts.values()]
+    paths = [forecast.most_likely for forecast in case.forecasts.values()]
     points = np.concatenate([case.history, case.truth, *paths])
-    points = points[np.hypot(*(points - now).T) <= _FARTHEST_M]
+    points = points[np.hypot(*(points - now).T) <= _MAX_RANGE_M]
     low, high = points.min(axis=0), points.max(axis=0)
-    half = max(float((high - low).max()) + 2 * _MARGIN_M, _LEAST_VIEW_M) / 2
+    half = max(float((high - low).max()) + 2 * _MARGIN_M, _MIN_VIEW_M) / 2
     middle = (low + high) / 2
     return middle - half, middle + half
 
 
 def _ground(axes: Axes, request: PredictRequest, low: Floats, high: Floats) -> None:
-    """Map, frame and view of a panel."""
+    """Draw map and frame of a panel, and set its view."""
     axes.set_facecolor(GROUND)
     draw_map(axes, request)
     axes.set_aspect("equal")
@@ -78,7 +78,7 @@ def _ground(axes: Axes, request: PredictRequest, low: Floats, high: Floats) -> N
 
 
 def _agent(axes: Axes, case: HardCase) -> None:
-    """Others, history, truth."""
+    """Draw the other agents, history and truth."""
     axes.plot(*case.others.T, "o", color="#9aa3ac", markersize=3.5, zorder=2)
     axes.plot(*case.history.T, "-", color=INK, linewidth=2.2, zorder=4)
     axes.plot(*case.history[-1], "o", color=INK, markersize=6, zorder=7)
@@ -86,28 +86,28 @@ def _agent(axes: Axes, case: HardCase) -> None:
     axes.plot(*case.truth[-1], "X", color=INK, markersize=6.5, markeredgecolor="white", zorder=7)
 
 
-def _likeliest(axes: Axes, case: HardCase, forecast: CaseForecast, style: Style) -> None:
-    path = _from_now(case, forecast.likeliest)
+def _most_likely(axes: Axes, case: HardCase, forecast: CaseForecast, style: Style) -> None:
+    path = _from_now(case, forecast.most_likely)
     axes.plot(*path.T, color=style.color, linestyle=style.line, linewidth=2.3, zorder=6)
     axes.plot(*path[-1], color=style.color, marker=style.marker, markersize=5.5, zorder=6)
 
 
 def _modes(axes: Axes, case: HardCase, forecast: CaseForecast, style: Style) -> None:
-    """The likelier the mode, the stronger its line."""
+    """Draw modes, the more likely the stronger."""
     heaviest = forecast.weights.max()
     for weight, mode in zip(forecast.weights, forecast.modes, strict=True):
-        if weight > _SMALLEST_WEIGHT:
+        if weight > _MIN_WEIGHT:
             alpha = 0.15 + 0.6 * float(weight / heaviest)
             axes.plot(*_from_now(case, mode).T, color=style.color, alpha=alpha, linewidth=1.1, zorder=3)
 
 
 def _from_now(case: HardCase, path: Floats) -> Floats:
-    """A path that starts where the agent is: [T, 2] → [T + 1, 2]."""
+    """Return a path from the agent's present position: [T, 2] → [T + 1, 2]."""
     return np.concatenate([case.history[-1:], path])
 
 
 def _scale(axes: Axes, low: Floats, high: Floats) -> None:
-    """A bar of ten metres."""
+    """Draw a scale bar of ten metres."""
     x, y = low + 0.05 * (high - low)
     axes.plot([x, x + _SCALE_M], [y, y], color=INK, linewidth=2.5, solid_capstyle="butt", zorder=8)
     axes.annotate(

@@ -1,50 +1,51 @@
-"""The page: everything in one file, which needs no script and asks nothing of the network."""
+"""HTML page of a report: one file without scripts and external resources."""
 
 import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
-from benchmark.hard import HardCase
+from benchmark.hard_cases import HardCase
 from benchmark.report import plots
 from benchmark.report.canvas import Style, png, styles, svg
 from benchmark.report.maps import case_map
-from benchmark.results import Results
+from benchmark.results import BenchmarkResults
 from benchmark.tables import left_out, tables
-from model.evaluation.text_tables import Table
+from model.evaluation.tables import Table
 
-REPORT_FILE = "report.html"
-_TEMPLATE = "page.html.j2"
+REPORT_FILE: Final = "report.html"
+_TEMPLATE: Final = "page.html.j2"
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture as a page holds it."""
+    """A figure of the page."""
 
     title: str
     source: str
     """Data URL."""
     alternative: str
-    """What it shows, for those who do not see it."""
+    """Alternative text."""
     caption: str
 
 
-def write_page(results: Results, cases: Sequence[HardCase], folder: Path) -> Path:
-    """Writes ``report.html``.
+def write_page(results: BenchmarkResults, cases: Sequence[HardCase], folder: Path) -> Path:
+    """Write ``report.html``.
 
     Args:
-        results: tables and curves are of these.
-        cases: hard cases to draw; may be none.
-        folder: where to; it exists.
+        results: results for tables and curves.
+        cases: hard cases to draw; may be empty.
+        folder: an existing folder.
 
     Returns:
         The file.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     environment = Environment(
         loader=PackageLoader("benchmark.report", ""),
@@ -68,8 +69,8 @@ def write_page(results: Results, cases: Sequence[HardCase], folder: Path) -> Pat
     return file
 
 
-def _facts(results: Results) -> dict[str, str]:
-    """What was asked, and of whom."""
+def _facts(results: BenchmarkResults) -> dict[str, str]:
+    """Return the settings of the run by name."""
     return {
         "Endpoint": results.endpoint,
         "Program": f"cab-forecast {results.version}",
@@ -83,14 +84,14 @@ def _facts(results: Results) -> dict[str, str]:
     }
 
 
-def _models(results: Results) -> Table:
+def _models(results: BenchmarkResults) -> Table:
     rows = tuple((model.key, model.protocol, model.trained_on) for model in results.models)
-    note = "What was judged; protocol: of the states that it was trained on."
+    note = "Protocol: that of the training data."
     return Table("Models", note, ("model", "protocol", "trained on"), rows)
 
 
-def _curves(results: Results) -> list[Picture]:
-    """Those that there are figures for."""
+def _curves(results: BenchmarkResults) -> list[Picture]:
+    """Return the curves that have figures."""
     names = ", ".join(model.key for model in results.models)
     made = (
         (
@@ -102,13 +103,13 @@ def _curves(results: Results) -> list[Picture]:
         (
             plots.calibration(results),
             "Calibration",
-            "A panel a model: share of the truth inside the 50, 90 and 99 % regions at 1 to 6 s",
-            "Below its dashed line a model is too sure, above it not sure enough. Table 5 has the figures.",
+            "One panel per model: share of the truth inside the 50, 90 and 99 % regions at 1 to 6 s",
+            "Below the dashed line: overconfident; above it: underconfident. Table 5 has the figures.",
         ),
         (
             plots.consistency(results),
             "Dispersion and convergence",
-            "Bars a model: dispersion in three forms, and convergence to three ranges",
+            "Bars per model: dispersion in three forms, and convergence to three ranges",
             "Table 2 has the figures.",
         ),
     )
@@ -125,9 +126,9 @@ def _case(case: HardCase, shown: Mapping[str, Style]) -> Picture:
     return Picture(
         f"{case.scene}, agent {case.agent}, frame {case.frame}",
         _data_url(png(case_map(case, shown)), "image/png"),
-        f"Map around agent {case.agent} in scene {case.scene}, frame {case.frame}: its past, where it went, "
-        f"and the forecasts of {', '.join(case.forecasts)}.",
-        f"The Kalman filter misses by {case.mismatch_m:.1f} m. FDE at 6 s: {errors}.",
+        f"Map around agent {case.agent} in scene {case.scene}, frame {case.frame}: its past, its true "
+        f"future, and the forecasts of {', '.join(case.forecasts)}.",
+        f"FDE at 6 s: Kalman filter {case.mismatch_m:.1f} m; {errors}.",
     )
 
 

@@ -1,4 +1,4 @@
-"""Curves and bars of a benchmark's results. Each is None where there is nothing to draw."""
+"""Curves and bars of a benchmark's results; None where there are no figures."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -10,8 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from benchmark.report.canvas import REFERENCE, Style, dress, empty, grid, plain, styles
-from benchmark.results import ModelResult, Results
-from benchmark.tables import label
+from benchmark.results import BenchmarkModelResult, BenchmarkResults
 from cab_forecast.plot_style import INK
 from model.arrays import Floats
 from model.evaluation.published import published_figures
@@ -20,17 +19,17 @@ from model.metrics.consistency import RANGES_M
 from model.metrics.displacement import HORIZONS_S
 
 _PAPER = {"cab": (0, (5.0, 2.0)), "trajectron": (0, (2.0, 2.0))}
-"""Rows of the paper that are drawn beside ours, with their dashes."""
+"""Models of the paper that are drawn for comparison, with their dashes."""
 _PERCENTS = {50: "#0072b2", 90: "#d55e00", 99: "#009e73"}
 _SHADES = ("#a6cbe2", "#4b93bf", "#0b4f7c")
 _METERS = (0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100)
 _PANELS_A_ROW = 4
 
 
-def error_by_horizon(results: Results) -> Figure | None:
-    """ADE and FDE of the most likely trajectory at 1 … 6 s, a line a model.
+def error_by_horizon(results: BenchmarkResults) -> Figure | None:
+    """Plot ADE and FDE of the most likely trajectory at 1 … 6 s, one line per model.
 
-    By the paper protocol with the paper's CAB and Trajectron++.
+    By the paper protocol, the paper's CAB and Trajectron++ are added.
     """
     models = _having(results, [f"ade_ml_{second}s_m" for second in HORIZONS_S])
     if not models:
@@ -41,14 +40,14 @@ def error_by_horizon(results: Results) -> Figure | None:
     for axes, kind in zip(figure.subplots(1, 2, sharey=True), ("ade", "fde"), strict=True):
         names = [f"{kind}_ml_{second}s_m" for second in HORIZONS_S]
         for model in models:
-            lines[label(model, results.protocol)] = _curve(axes, model.metrics, names, found[model.key])
+            lines[model.label(results.protocol)] = _curve(axes, model.metrics, names, found[model.key])
         if results.protocol is Protocol.PAPER:
             for name, dashes in _PAPER.items():
                 lines[f"{name}, in the paper"] = _curve(
                     axes, published_figures(name), names, Style(INK, dashes, "")
                 )
         _by_horizon(axes, f"{kind.upper()} of the most likely trajectory, m")
-        # Errors at 1 s and at 6 s are of different orders: by a plain scale the first would be one line
+        # Errors at 1 s and at 6 s differ by orders of magnitude
         axes.set_yscale("log")
         axes.yaxis.set_major_locator(FixedLocator(_METERS))
         axes.yaxis.set_minor_locator(NullLocator())
@@ -61,8 +60,8 @@ def error_by_horizon(results: Results) -> Figure | None:
     return figure
 
 
-def calibration(results: Results) -> Figure | None:
-    """Share of the truth inside the 50, 90 and 99 % regions at 1 … 6 s, a panel a model."""
+def calibration(results: BenchmarkResults) -> Figure | None:
+    """Plot the share of the truth inside the 50, 90 and 99 % regions at 1 … 6 s, one panel per model."""
     models = _having(
         results, [f"inside_{percent}_{second}s" for percent in _PERCENTS for second in HORIZONS_S]
     )
@@ -74,20 +73,22 @@ def calibration(results: Results) -> Figure | None:
             names = [f"inside_{percent}_{second}s" for second in HORIZONS_S]
             axes.axhline(percent / 100, color=color, linewidth=1.0, linestyle=(0, (4, 2)))
             _curve(axes, model.metrics, names, Style(color, "-", "o"))
-        _by_horizon(axes, label(model, results.protocol).replace(" (", "\n("), size=8.5)
+        _by_horizon(axes, model.label(results.protocol).replace(" (", "\n("), size=8.5)
         axes.set_ylim(0.0, 1.04)
         axes.set_yticks([0.0, 0.5, 0.9, 0.99], ["0", "50", "90", "99"])
     handles = [Line2D([], [], color=color, marker="o", markersize=4) for color in _PERCENTS.values()]
     handles.append(Line2D([], [], color=REFERENCE, linestyle=(0, (4, 2))))
-    said = [f"observed in the {percent} % region, %" for percent in _PERCENTS]
-    figure.legend(handles, [*said, "as said"], loc="outside lower center", ncols=4, fontsize=9, frameon=False)
+    observed = [f"observed in the {percent} % region, %" for percent in _PERCENTS]
+    figure.legend(
+        handles, [*observed, "nominal"], loc="outside lower center", ncols=4, fontsize=9, frameon=False
+    )
     return figure
 
 
-def consistency(results: Results) -> Figure | None:
-    """Bars of dispersion in its three forms, and of convergence to three ranges.
+def consistency(results: BenchmarkResults) -> Figure | None:
+    """Plot bars of dispersion in its three forms, and of convergence to three ranges.
 
-    By the paper protocol with the paper's figures as strokes across.
+    By the paper protocol, the paper's figures are added as strokes.
     """
     spreads = {"std": "dispersion_std_m", "mean": "dispersion_mean_m", "rms": "dispersion_rms_m"}
     ranges = {f"C({range_m:g} m)": f"convergence_{range_m:g}m_s" for range_m in RANGES_M}
@@ -96,15 +97,19 @@ def consistency(results: Results) -> Figure | None:
         return None
     figure = empty(11.5, 1.4 + 0.42 * len(models))
     left, right = figure.subplots(1, 2, sharey=True)
-    _bars(left, results, models, spreads, "Dispersion D, m (less is steadier)")
-    _bars(right, results, models, ranges, "Convergence C, s (more is earlier right)")
-    left.set_yticks(range(len(models)), [plain(label(model, results.protocol)) for model in models])
+    _bars(left, results, models, spreads, "Dispersion D, m (lower is better)")
+    _bars(right, results, models, ranges, "Convergence C, s (higher is better)")
+    left.set_yticks(range(len(models)), [plain(model.label(results.protocol)) for model in models])
     left.set_ylim(len(models) - 0.4, -0.6)
     return figure
 
 
 def _bars(
-    axes: Axes, results: Results, models: Sequence[ModelResult], columns: Mapping[str, str], title: str
+    axes: Axes,
+    results: BenchmarkResults,
+    models: Sequence[BenchmarkModelResult],
+    columns: Mapping[str, str],
+    title: str,
 ) -> None:
     height = 0.8 / len(columns)
     for place, (name, metric) in enumerate(columns.items()):
@@ -134,7 +139,7 @@ def _bars(
 
 
 def _curve(axes: Axes, figures: Mapping[str, float], names: Sequence[str], style: Style) -> Line2D:
-    """Draws figures of 1 … 6 s."""
+    """Draw figures of 1 … 6 s."""
     values = [figures.get(name, math.nan) for name in names]
     (line,) = axes.plot(
         HORIZONS_S,
@@ -154,12 +159,12 @@ def _by_horizon(axes: Axes, title: str, size: float = 10) -> None:
     axes.set_xticks(HORIZONS_S, [f"{second} s" for second in HORIZONS_S])
 
 
-def _figures(models: Sequence[ModelResult], metric: str) -> Floats:
+def _figures(models: Sequence[BenchmarkModelResult], metric: str) -> Floats:
     return np.array([model.metrics.get(metric, math.nan) for model in models], dtype=np.float64)
 
 
-def _having(results: Results, metrics: Sequence[str]) -> list[ModelResult]:
-    """Models with any of these."""
+def _having(results: BenchmarkResults, metrics: Sequence[str]) -> list[BenchmarkModelResult]:
+    """Return the models with any of the metrics."""
     return [
         model
         for model in results.models

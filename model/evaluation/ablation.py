@@ -1,7 +1,7 @@
-"""Does the context matter? Forecasts from features of which a part is taken away.
+"""Context ablation: features of which the map, the neighbours or both are removed.
 
-What is taken away counts as unknown, as for CAB's blind forecast (REFERENCE, section 3): the map is zero
-after scaling, midway between absent and present; there are no neighbours.
+A removed part counts as unknown, as in CAB's blind forecast (REFERENCE, section 3): the map is zero after
+scaling, midway between absent and present; there are no neighbours.
 """
 
 from collections.abc import Callable, Mapping
@@ -12,14 +12,12 @@ import torch
 from model.forecaster import Features, ModelInfo
 
 _NEIGHBORS = ("neighbors", "edge_mask", "neighbor_boxes")
-"""Features that tell of them, up to the dot; zero means that there are none."""
-
-
+"""Names of the neighbours' features, up to the dot; all zeros mean that there are none."""
 _MAPS = frozenset({"map", "far_map"})
 
 
 class Without(StrEnum):
-    """What is taken away."""
+    """The part of the context that is removed."""
 
     MAP = "map"
     NEIGHBORS = "neighbors"
@@ -27,35 +25,33 @@ class Without(StrEnum):
 
 
 def without_map(features: Features) -> Features:
-    """The features with the null map.
+    """Return the features with a null map.
 
     Args:
-        features: of ``model.features.scene_features``; ``map`` and, where there is one, ``far_map`` [N, 3,
-            100, 100] in
-            [-1, 1].
+        features: features of ``model.features.scene_features``; ``map`` and, where present, ``far_map``
+            [N, 3, 100, 100] in [-1, 1].
     """
     return features | {name: torch.zeros_like(features[name]) for name in _MAPS & features.keys()}
 
 
 def without_neighbors(features: Features) -> Features:
-    """The features of agents that are alone.
+    """Return the features of agents without neighbours.
 
     Args:
-        features: of ``model.features.scene_features``; ``neighbors.<type>`` [N, F, D] and ``edge_mask`` [N],
-            or
-            ``neighbors`` [N, M, 11], or ``neighbor_boxes`` [N, S, 5].
+        features: features of ``model.features.scene_features``; ``neighbors.<type>`` [N, F, D] and
+            ``edge_mask`` [N], or ``neighbors`` [N, M, 11], or ``neighbor_boxes`` [N, S, 5].
     """
-    gone = [name for name in features if name.partition(".")[0] in _NEIGHBORS]
-    return features | {name: torch.zeros_like(features[name]) for name in gone}
+    removed = [name for name in features if name.partition(".")[0] in _NEIGHBORS]
+    return features | {name: torch.zeros_like(features[name]) for name in removed}
 
 
 def without_both(features: Features) -> Features:
-    """The features with neither map nor neighbours."""
+    """Return the features with neither map nor neighbours."""
     return without_neighbors(without_map(features))
 
 
 def ablations(info: ModelInfo) -> Mapping[Without, Callable[[Features], Features]]:
-    """What can be taken away from a model: of one that does not look at it, nothing."""
+    """Return the ablations of a model: only of what it uses."""
     if info.uses_map and info.uses_neighbors:
         return {Without.MAP: without_map, Without.NEIGHBORS: without_neighbors, Without.BOTH: without_both}
     if info.uses_map:

@@ -1,7 +1,6 @@
-"""Tables 1 to 3 of Ben-Younes et al. 2022 (arXiv 2109.08048), to stand beside our figures.
+"""Tables 1 to 3 of Ben-Younes et al. 2022 (arXiv 2109.08048), for comparison with our figures.
 
-Their states are those of the paper protocol, and their pairs those of the paper's own split. All are by our
-names of the models, and tell their figures by ours of the metrics.
+The paper's inputs follow the paper protocol, on the paper's own split. Models and metrics have our names.
 """
 
 from collections.abc import Mapping
@@ -26,7 +25,7 @@ class Published:
     """ADE-f and FDE-f at 6 s, m, and OffR-f, of 2000 samples; None: not tabulated."""
 
     def figures(self) -> dict[str, float]:
-        """By the names of ``model.metrics.evaluate``."""
+        """Return the figures by the names of ``model.metrics.evaluate``."""
         figures = {f"ade_ml_{second}s_m": value for second, value in enumerate(self.ade_ml_m, start=1)}
         figures |= {f"fde_ml_{second}s_m": value for second, value in enumerate(self.fde_ml_m, start=1)}
         figures["off_road_ml"] = self.off_road_ml
@@ -37,7 +36,7 @@ class Published:
 
 @dataclass(frozen=True)
 class PublishedConsistency:
-    """A row of table 2: how forecasts change as their agent drives on."""
+    """A row of table 2: temporal consistency of the forecasts."""
 
     dispersion_m: float
     """D."""
@@ -45,10 +44,10 @@ class PublishedConsistency:
     """C(0.2 m), C(1 m) and C(5 m)."""
 
     def figures(self) -> dict[str, float]:
-        """By the names of ``benchmark.consistency``.
+        """Return the figures by the names of ``benchmark.evaluate.CONSISTENCY``.
 
-        D is under two of them: the standard deviation is what the paper's formula says, and the mean distance
-        is what its figures fit better (REFERENCE.md section 4).
+        D is returned under two names: the paper's formula is the standard deviation, but its figures fit the
+        mean distance better (REFERENCE.md section 4).
         """
         names = [f"convergence_{range_m:g}m_s" for range_m in RANGES_M]
         figures = dict.fromkeys(("dispersion_std_m", "dispersion_mean_m"), self.dispersion_m)
@@ -57,13 +56,13 @@ class PublishedConsistency:
 
 @dataclass(frozen=True)
 class PublishedHardCases:
-    """A row of table 3: where the Kalman filter errs most."""
+    """A row of table 3: the pairs with the largest errors of the Kalman filter."""
 
     fde_6s_m: tuple[float, float, float, float]
     """On the hardest 1, 2 and 3 % of the pairs, and on all."""
 
     def figures(self) -> dict[str, float]:
-        """By the names of ``benchmark.hard``."""
+        """Return the figures by the names of ``benchmark.hard_cases.hardest_fde``."""
         names = [*(f"fde_hardest_{round(100 * share)}_m" for share in HARD_SHARES), "fde_hardest_all_m"]
         return dict(zip(names, self.fde_6s_m, strict=True))
 
@@ -129,7 +128,7 @@ PUBLISHED_HARD_CASES: Mapping[str, PublishedHardCases] = {
 
 
 def published_figures(model: str) -> dict[str, float]:
-    """All that the paper has of a model, by the names of the metrics; empty: nothing."""
+    """Return all figures of the paper for a model, by the names of the metrics; empty if it has none."""
     tables = (PUBLISHED, PUBLISHED_CONSISTENCY, PUBLISHED_HARD_CASES)
     figures: dict[str, float] = {}
     for table in tables:

@@ -1,4 +1,4 @@
-"""A whole evaluation: what ``cab-forecast evaluate`` does."""
+"""A whole evaluation in this process: the work of ``cab-forecast evaluate``."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -6,127 +6,125 @@ from functools import partial
 from pathlib import Path
 
 from model.data.scenes import DataError, Reader
-from model.evaluation.baselines import judge_baselines
-from model.evaluation.learned import Judged, judge_learned, open_validations
-from model.evaluation.results import Results, Row
-from model.evaluation.subjects import Subjects
+from model.evaluation.in_process import ModelMeans, evaluate_baselines, evaluate_checkpoints, open_validations
+from model.evaluation.results import TABLES_FILE, EvaluationModelResult, EvaluationResults, replace_text
+from model.evaluation.selection import Selection
 from model.evaluation.tables import markdown
 from model.forecaster import ModelInfo, Protocol
 from model.metrics.aggregate import MetricMeans
 from model.metrics.density import DRAWS
 from model.metrics.oracle import ORACLE
-
-RESULTS_FILE = "results.json"
-TABLES_FILE = "tables.md"
+from model.metrics.pairs import Sampling
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What is judged, and on what."""
+    """Models and data of an evaluation."""
 
-    subjects: Subjects
+    models: Selection
     kind: str
-    """Of the data set."""
+    """Kind of the data set."""
     reader: Reader
     split: str
     protocol: Protocol
+    """Protocol of the inputs."""
     cache: Path
     """Folder of the caches; training runs may share it."""
     samples: int = 200
     """Trajectories drawn for each pair; 0: none, and no calibration."""
     limit: int | None = None
-    """How many of the first pairs; None: all."""
+    """Number of pairs, from the first; None: all."""
     ablate: bool = False
-    """Whether to judge checkpoints with less context, too."""
+    """Whether to evaluate checkpoints with less context, too."""
 
-    def __call__(self, tick: Callable[[str, int], None], said: Callable[[str], None]) -> Results:
-        """Judges all models.
+    def __call__(self, tick: Callable[[str, int], None], log: Callable[[str], None]) -> EvaluationResults:
+        """Evaluate all models.
 
         Args:
-            tick: told what goes on and how many pairs of it are done.
-            said: told in words what else goes on.
+            tick: called with the names of the current models and the number of pairs done.
+            log: called with other messages.
 
         Raises:
-            DataError: the data is bad, or the split unknown.
+            DataError: the data is invalid, or the split unknown.
         """
         if self.split not in self.reader.splits:
             raise DataError(f"there is no split {self.split!r}; there are {', '.join(self.reader.splits)}")
-        draws = DRAWS if self.samples else 0
-        judged: dict[str, Judged] = {}
+        sampling = Sampling(self.samples, DRAWS if self.samples else 0)
+        means: dict[str, ModelMeans] = {}
         validations = open_validations(
-            self.subjects.learned, self.cache, self.reader, self.kind, self.split, self.protocol, said
+            self.models.learned, self.cache, self.reader, self.kind, self.split, self.protocol, log
         )
         for validation, models in validations:
             names = ", ".join(model.info.name for model in models)
-            judged |= judge_learned(
-                validation,
-                models,
-                self.ablate,
-                self.samples,
-                draws,
-                self.limit,
-                partial(tick, names),
+            means |= evaluate_checkpoints(
+                validation, models, self.ablate, sampling, self.limit, partial(tick, names)
             )
-        if self.subjects.baselines or self.subjects.oracle:
-            means = judge_baselines(
+        if self.models.baselines or self.models.oracle:
+            baselines = evaluate_baselines(
                 self.reader,
                 self.split,
                 self.protocol,
-                self.subjects.baselines,
-                self.subjects.oracle,
-                self.samples,
-                draws,
+                self.models.baselines,
+                self.models.oracle,
+                sampling,
                 self.limit,
                 partial(tick, "baselines"),
             )
-            judged |= {name: Judged(metrics) for name, metrics in means.items()}
-        counts = {_pairs(one.metrics) for one in judged.values()}
+            means |= {name: ModelMeans(metrics) for name, metrics in baselines.items()}
+        counts = {_pairs(one.metrics) for one in means.values()}
         if len(counts) > 1:
             raise DataError(f"{self.cache}: holds caches of other data: {sorted(counts)} pairs; remove them")
-        return Results(
+        return EvaluationResults(
             data=self.kind,
             split=self.split,
             protocol=self.protocol,
             pairs=counts.pop(),
             limit=self.limit,
-            samples=self.samples,
-            draws=draws,
+            samples=sampling.samples,
+            draws=sampling.draws,
             ablate=self.ablate,
-            rows=self._rows(judged),
+            models=self._results(means),
         )
 
-    def _rows(self, judged: Mapping[str, Judged]) -> tuple[Row, ...]:
-        """In the order of the tables: baselines, oracle, checkpoints."""
-        subjects = self.subjects
-        rows = [_row(one.info, judged[one.info.full_name], learned=False) for one in subjects.baselines]
-        if subjects.oracle:
+    def _results(self, means: Mapping[str, ModelMeans]) -> tuple[EvaluationModelResult, ...]:
+        """Return results in the order of the tables: baselines, oracle, checkpoints."""
+        models = self.models
+        rows = [_result(one.info, means[one.info.full_name], learned=False) for one in models.baselines]
+        if models.oracle:
+            metrics = means[ORACLE].metrics.figures()
             rows.append(
-                Row(ORACLE, "", learned=False, trained_on="", metrics=judged[ORACLE].metrics.figures())
+                EvaluationModelResult(name=ORACLE, version="", learned=False, trained_on="", metrics=metrics)
             )
-        rows += [_row(one.info, judged[one.info.full_name], learned=True) for one in subjects.learned]
+        rows += [_result(one.info, means[one.info.full_name], learned=True) for one in models.learned]
         return tuple(rows)
 
 
-def _row(info: ModelInfo, judged: Judged, learned: bool) -> Row:
-    ablated = {without.value: means.figures() for without, means in judged.ablated.items()}
-    return Row(info.name, info.version, learned, info.trained_on, judged.metrics.figures(), ablated)
+def write_results(results: EvaluationResults, folder: Path) -> None:
+    """Write ``results.json`` and ``tables.md``, replacing existing files.
+
+    Args:
+        results: results of an evaluation.
+        folder: output folder, created if missing.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    results.write(folder)
+    replace_text(folder / TABLES_FILE, markdown(results))
+
+
+def _result(info: ModelInfo, means: ModelMeans, learned: bool) -> EvaluationModelResult:
+    return EvaluationModelResult(
+        name=info.name,
+        version=info.version,
+        learned=learned,
+        trained_on=info.trained_on,
+        metrics=means.metrics.figures(),
+        ablated={without.value: ablated.figures() for without, ablated in means.ablated.items()},
+    )
 
 
 def _pairs(means: MetricMeans) -> int:
     name = "fde_ml_6s_m"
     return means.count(name) + means.missing(name)
-
-
-def write_results(results: Results, folder: Path) -> None:
-    """Writes ``results.json`` and ``tables.md``; what is there is replaced.
-
-    Args:
-        results: of an evaluation.
-        folder: made where it does not exist.
-
-    Raises:
-        OSError: it cannot be written.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / RESULTS_FILE).write_text(results.to_json(), encoding="utf-8")
-    (folder / TABLES_FILE).write_text(markdown(results), encoding="utf-8")

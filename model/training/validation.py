@@ -1,54 +1,32 @@
 """Evaluation of networks on the pairs of a split."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 
-from model.arrays import Bools, Floats
 from model.data.batches import Batches
 from model.data.cache import Cache
 from model.forecaster import Context, Features
 from model.metrics.aggregate import MetricMeans
-from model.metrics.evaluate import instance_metrics
+from model.metrics.pairs import EvaluatedPairs, Sampling
 from model.metrics.standing import stood
-from model.mixture import TrajectoryMixture
 from model.networks.config import AnyNetworkConfig
 from model.networks.forecaster import Networks, network_mixture
-from model.scenes.scene import AgentType, Raster
+from model.scenes.scene import AgentType
 
 BATCH = 512
 
 
 @dataclass(frozen=True)
 class EvaluationBatch:
-    """N pairs, and what their forecasts are evaluated against."""
+    """N pairs with the inputs of a network."""
 
     features: Features
     """Features with full context, on the device."""
-    truth: Floats
-    """[N, 12, 2], m, ground frame."""
-    rasters: Sequence[Raster]
-    """N rasters; pairs of a scene share one."""
-    stood: Bools
-    """[N], whether the agents stood before now (``model.metrics.standing``)."""
-    seeds: Sequence[int]
-    """N numbers of the pairs in the split, so that samples of a pair do not depend on its batch."""
-
-    def metrics(self, mixture: TrajectoryMixture, samples: int, draws: int) -> dict[str, Floats]:
-        """Return ``instance_metrics`` of forecasts of these pairs.
-
-        Args:
-            mixture: the forecasts.
-            samples: trajectories drawn for each pair; 0: no sampled figures.
-            draws: positions drawn for calibration; 0: no calibration.
-        """
-        seeds = self.seeds if samples or draws else None
-        return instance_metrics(
-            mixture, self.truth, self.rasters, seeds, samples=samples, draws=draws, stood=self.stood
-        )
+    pairs: EvaluatedPairs
 
 
 class Validation:
@@ -90,8 +68,8 @@ class Validation:
         network = networks.of(AgentType.VEHICLE)
         means = MetricMeans()
         for batch in self.batches():
-            mixture = network_mixture(network, batch.features, Context.FULL, batch.truth.shape[1])
-            means.add(batch.metrics(mixture, samples, draws))
+            mixture = network_mixture(network, batch.features, Context.FULL, batch.pairs.truth.shape[1])
+            means.add(batch.pairs.metrics(mixture, Sampling(samples, draws)))
         return {name: value for name, value in means.figures().items() if np.isfinite(value)}
 
     def batches(self, limit: int | None = None) -> Iterator[EvaluationBatch]:
@@ -107,10 +85,8 @@ class Validation:
             truth = (future.double() + features["origin"][:, None]).cpu().numpy()
             scenes = self._cache.scene[indices.numpy()].tolist()
             rasters = {scene: self._cache.raster(scene) for scene in set(scenes)}
+            numbers = indices.numpy()
             yield EvaluationBatch(
                 features,
-                truth,
-                [rasters[scene] for scene in scenes],
-                self._stood[indices.numpy()],
-                indices.tolist(),
+                EvaluatedPairs(numbers, truth, [rasters[scene] for scene in scenes], self._stood[numbers]),
             )

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmark.hard import CaseForecast, HardCase
+from benchmark.hard_cases import CaseForecast, HardCase
 from benchmark.models import BASELINES
-from benchmark.results import Latency, ModelResult, Results
+from benchmark.results import BenchmarkModelResult, BenchmarkResults, Latency
 from model.forecaster import Protocol
 from model.metrics.consistency import RANGES_M
 from model.metrics.evaluate import MOVING, MOVING_FIGURES
@@ -75,9 +75,9 @@ def made_model(
     version: str = "1.0.0",
     protocol: str = "causal",
     metrics: Mapping[str, float] | None = None,
-) -> ModelResult:
+) -> BenchmarkModelResult:
     """A model of ten pairs, nine of which are OK."""
-    return ModelResult(
+    return BenchmarkModelResult(
         name=name,
         version=version,
         protocol=protocol,
@@ -89,15 +89,15 @@ def made_model(
     )
 
 
-def made_oracle() -> ModelResult:
+def made_oracle() -> BenchmarkModelResult:
     """The oracle, which nobody calls."""
     oracle = made_model("physics-oracle", "", "any", made_metrics(1.1))
     return replace(oracle, latency=None, instants=0, statuses={})
 
 
-def made_results(*models: ModelResult, protocol: Protocol = Protocol.CAUSAL) -> Results:
+def made_results(*models: BenchmarkModelResult, protocol: Protocol = Protocol.CAUSAL) -> BenchmarkResults:
     """Results on ten pairs; of cab alone, unless told otherwise."""
-    return Results(
+    return BenchmarkResults(
         data="made",
         split="some",
         protocol=protocol,
@@ -115,7 +115,7 @@ def made_results(*models: ModelResult, protocol: Protocol = Protocol.CAUSAL) -> 
     )
 
 
-def all_models() -> tuple[ModelResult, ...]:
+def all_models() -> tuple[BenchmarkModelResult, ...]:
     """One of every name, and the oracle; each a little worse than the one before."""
     served = [
         made_model(

@@ -18,7 +18,7 @@ PAIRS = sum(len(one.pairs) for one in RECORDS)
 
 
 def planned(consistency: bool = True, limit: int | None = None) -> list[PlannedScene]:
-    """What is asked about ``RECORDS``."""
+    """Plan of ``RECORDS``."""
     return list(plan_scenes(READER, "some", consistency=consistency, limit=limit))
 
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmark import BenchmarkError
 from benchmark.archive import FILE, Answer, Archive
+from benchmark.errors import BenchmarkError
 from benchmark.plan import Call
 from cab.forecast.v1.model_service_pb2 import Model
 from cab.forecast.v1.prediction_service_pb2 import PredictResponse
@@ -63,7 +63,7 @@ def test_another_model_of_the_same_name_is_refused(tmp_path: Path) -> None:
         same = Model(name="cab", version="1.0.0", trained_on="this", benchmark={"b": 2.0, "a": 1.0})
         same.is_default = True
         archive.register("cab@1.0.0", same)
-        with pytest.raises(BenchmarkError, match=r"cab@1\.0\.0 of the endpoint is not the one"):
+        with pytest.raises(BenchmarkError, match=r"cab@1\.0\.0 of the endpoint is not the model"):
             archive.register("cab@1.0.0", Model(name="cab", version="1.0.0", trained_on="that"))
         assert list(archive.models()) == ["cab@1.0.0"]
         # Words and figures about it may be mended

@@ -1,28 +1,37 @@
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pytest
 
-from benchmark import BenchmarkError
-from benchmark.compare import Comparison, Difference, compare, markdown, table
-from benchmark.results import INSTANCES_FILE, RESULTS_FILE, Results, write_instances
-from model.arrays import Floats
+from benchmark.compare import Comparison, Difference, bootstrap_interval, compare, markdown, table
+from benchmark.errors import BenchmarkError
+from benchmark.results import INSTANCES_FILE, BenchmarkResults, Instances
+from model.arrays import Floats, Ints
+from model.evaluation.results import RESULTS_FILE
 from model.forecaster import Protocol
 from tests.benchmark.builders import made_metrics, made_model, made_oracle, made_results
 
 PAIRS = 10
 FDE = "cab@1.0.0/fde_ml_6s_m"
+NONE: Mapping[str, Floats] = MappingProxyType({})
 
 
-def saved(folder: Path, results: Results, **figures: Floats) -> Path:
+def saved(
+    folder: Path,
+    results: BenchmarkResults,
+    figures: Mapping[str, Floats] = NONE,
+    scenes: Ints | None = None,
+) -> Path:
     """A run's folder; figures of each pair where there are any."""
     folder.mkdir()
     results.write(folder)
     if figures:
-        write_instances(folder, figures)
+        Instances(figures, scenes).write(folder)
     return folder
 
 
@@ -31,7 +40,7 @@ def difference(comparison: Comparison, figure: str, model: int = 0) -> Differenc
     return found
 
 
-def two(tmp_path: Path, a: Results, b: Results) -> Comparison:
+def two(tmp_path: Path, a: BenchmarkResults, b: BenchmarkResults) -> Comparison:
     return compare(saved(tmp_path / "a", a), saved(tmp_path / "b", b))
 
 
@@ -40,8 +49,8 @@ def test_the_standard_error_by_hand(tmp_path: Path) -> None:
     a = np.full(PAIRS, 5.0)
     a[9] = np.nan  # so that eight pairs are in both
     comparison = compare(
-        saved(tmp_path / "a", made_results(), **{FDE: a}),
-        saved(tmp_path / "b", made_results(), **{FDE: 5.0 + apart}),
+        saved(tmp_path / "a", made_results(), {FDE: a}),
+        saved(tmp_path / "b", made_results(), {FDE: 5.0 + apart}),
     )
     found = difference(comparison, "FDE-ML 6 s")
     assert found.pairs == 8
@@ -50,15 +59,15 @@ def test_the_standard_error_by_hand(tmp_path: Path) -> None:
     assert found.clear
     assert difference(comparison, "ADE-ML 6 s").pairs == 0
     row = next(line for line in table(comparison).rows if line[1] == "FDE-ML 6 s")
-    assert row == ("cab@1.0.0", "FDE-ML 6 s", "7.200", "7.200", "+4.500", "0.866", "8", "yes")
+    assert row == ("cab@1.0.0", "FDE-ML 6 s", "7.200", "7.200", "+4.500", "0.866", "-", "8", "yes")
 
 
 def test_a_difference_within_noise_is_not_clear(tmp_path: Path) -> None:
     generator = np.random.default_rng(0)
     a = generator.normal(8.0, 3.0, PAIRS)
     comparison = compare(
-        saved(tmp_path / "a", made_results(), **{FDE: a}),
-        saved(tmp_path / "b", made_results(), **{FDE: a + np.tile([1.0, -0.9], PAIRS // 2)}),
+        saved(tmp_path / "a", made_results(), {FDE: a}),
+        saved(tmp_path / "b", made_results(), {FDE: a + np.tile([1.0, -0.9], PAIRS // 2)}),
     )
     assert difference(comparison, "FDE-ML 6 s").clear is False
     assert comparison.remarks == ()
@@ -67,7 +76,7 @@ def test_a_difference_within_noise_is_not_clear(tmp_path: Path) -> None:
 def test_the_same_run_differs_in_nothing(tmp_path: Path) -> None:
     figures = {FDE: np.arange(PAIRS, dtype=np.float64)}
     comparison = compare(
-        saved(tmp_path / "a", made_results(), **figures), saved(tmp_path / "b", made_results(), **figures)
+        saved(tmp_path / "a", made_results(), figures), saved(tmp_path / "b", made_results(), figures)
     )
     found = difference(comparison, "FDE-ML 6 s")
     assert (found.difference, found.standard_error, found.clear) == (0.0, 0.0, False)
@@ -78,8 +87,8 @@ def test_one_pair_has_no_standard_error(tmp_path: Path) -> None:
     lone = np.full(PAIRS, np.nan)
     lone[0] = 1.0
     comparison = compare(
-        saved(tmp_path / "a", made_results(), **{FDE: lone}),
-        saved(tmp_path / "b", made_results(), **{FDE: 2 * lone}),
+        saved(tmp_path / "a", made_results(), {FDE: lone}),
+        saved(tmp_path / "b", made_results(), {FDE: 2 * lone}),
     )
     found = difference(comparison, "FDE-ML 6 s")
     assert (found.difference, found.pairs, found.clear) == (1.0, 1, None)
@@ -97,15 +106,15 @@ def test_what_differs_is_said_in_words(tmp_path: Path) -> None:
         "consistency: yes in A, no in B",
         "seed: 3 in A, 4 in B",
         "the plans differ (other pairs, calls or data): 0123456789ab in A, fedcba987654 in B",
-        "the runs are of other pairs or plans: no comparison pair by pair",
+        "the runs are of other pairs or plans: no paired comparison",
     )
 
 
 def test_pairs_of_another_plan_are_not_compared_one_by_one(tmp_path: Path) -> None:
     figures = {FDE: np.arange(PAIRS, dtype=np.float64)}
     comparison = compare(
-        saved(tmp_path / "a", made_results(), **figures),
-        saved(tmp_path / "b", replace(made_results(), plan="other"), **figures),
+        saved(tmp_path / "a", made_results(), figures),
+        saved(tmp_path / "b", replace(made_results(), plan="other"), figures),
     )
     assert difference(comparison, "FDE-ML 6 s").pairs == 0
 
@@ -116,7 +125,7 @@ def test_without_figures_of_each_pair_the_means_are_compared(tmp_path: Path) -> 
     found = difference(comparison, "FDE-ML 6 s")
     assert (found.a, found.b, found.difference) == (7.2, 3.6, -3.6)
     assert found.clear is None
-    assert comparison.remarks == ("no figures of each pair in A and B: no comparison pair by pair",)
+    assert comparison.remarks == ("no figures of each pair in A and B: no paired comparison",)
 
 
 def test_models_are_matched_by_key_then_by_name(tmp_path: Path) -> None:
@@ -156,8 +165,8 @@ def test_models_are_matched_by_key_then_by_name(tmp_path: Path) -> None:
 def test_another_version_is_compared_pair_by_pair(tmp_path: Path) -> None:
     later = made_results(made_model("cab", "1.1.0"))
     comparison = compare(
-        saved(tmp_path / "a", made_results(), **{FDE: np.full(PAIRS, 3.0)}),
-        saved(tmp_path / "b", later, **{"cab@1.1.0/fde_ml_6s_m": np.full(PAIRS, 1.0)}),
+        saved(tmp_path / "a", made_results(), {FDE: np.full(PAIRS, 3.0)}),
+        saved(tmp_path / "b", later, {"cab@1.1.0/fde_ml_6s_m": np.full(PAIRS, 1.0)}),
     )
     found = difference(comparison, "FDE-ML 6 s")
     assert (found.difference, found.pairs) == (-2.0, PAIRS)
@@ -167,7 +176,7 @@ def test_a_figure_that_one_run_lacks_is_a_dash(tmp_path: Path) -> None:
     fewer = {name: value for name, value in made_metrics().items() if name != "dispersion_std_m"}
     comparison = two(tmp_path, made_results(), made_results(made_model(metrics=fewer)))
     row = next(line for line in table(comparison).rows if line[1] == "D, std")
-    assert row[2:] == ("2.000", "-", "-", "-", "0", "unknown")
+    assert row[2:] == ("2.000", "-", "-", "-", "-", "0", "unknown")
 
 
 def test_nothing_in_common(tmp_path: Path) -> None:
@@ -193,7 +202,7 @@ def test_what_are_no_results_is_named(tmp_path: Path, text: str) -> None:
 
 def test_figures_that_are_cut_short_are_named(tmp_path: Path) -> None:
     made_results().write(tmp_path)
-    write_instances(tmp_path, {"cab@1.0.0/nll": np.zeros(10)})
+    Instances({"cab@1.0.0/nll": np.zeros(10)}).write(tmp_path)
     file = tmp_path / "instances.npz"
     file.write_bytes(file.read_bytes()[:-30])
     with pytest.raises(BenchmarkError, match=r"instances\.npz: cannot be read"):
@@ -201,7 +210,63 @@ def test_figures_that_are_cut_short_are_named(tmp_path: Path) -> None:
 
 
 def test_figures_of_another_number_of_pairs_are_refused(tmp_path: Path) -> None:
-    a = saved(tmp_path / "a", made_results(), **{FDE: np.zeros(PAIRS)})
-    b = saved(tmp_path / "b", made_results(), **{FDE: np.zeros(PAIRS - 1)})
+    a = saved(tmp_path / "a", made_results(), {FDE: np.zeros(PAIRS)})
+    b = saved(tmp_path / "b", made_results(), {FDE: np.zeros(PAIRS - 1)})
     with pytest.raises(BenchmarkError, match=INSTANCES_FILE):
         compare(a, b)
+
+
+def test_the_interval_is_a_bootstrap_over_scenes_by_hand() -> None:
+    """Two scenes give three means: both times the first, one of each, both times the second."""
+    values, scenes = np.array([1.0, 1.0, 1.0, 5.0]), np.array([3, 3, 3, 7])
+    assert bootstrap_interval(values, scenes) == (1.0, 5.0)
+    three = bootstrap_interval(np.array([0.0, 0.0, 6.0]), np.array([0, 1, 2]))
+    # All three are the last scene with probability 1/27 > 0.025, none is with 8/27
+    assert three == (0.0, 6.0)
+
+
+def test_the_interval_of_many_scenes_is_that_of_the_normal_distribution() -> None:
+    """Scenes of 4 equal pairs: pairs taken as independent would halve the interval."""
+    scenes = np.repeat(np.arange(400), 4)
+    values = np.repeat(np.random.default_rng(5).normal(1.0, 2.0, 400), 4)
+    low, high = bootstrap_interval(values, scenes)
+    error = values[::4].std() / 20
+    assert low == pytest.approx(values.mean() - 1.96 * error, abs=0.2 * error)
+    assert high == pytest.approx(values.mean() + 1.96 * error, abs=0.2 * error)
+    assert bootstrap_interval(values, scenes) == (low, high)
+    order = np.random.default_rng(6).permutation(len(values))
+    assert bootstrap_interval(values[order], scenes[order]) == pytest.approx((low, high))
+
+
+def test_one_scene_has_no_interval() -> None:
+    for scenes in ([], [4, 4]):
+        assert np.isnan(bootstrap_interval(np.ones(len(scenes)), np.array(scenes, dtype=np.int64))).all()
+
+
+def test_a_difference_of_one_scene_alone_is_not_clear(tmp_path: Path) -> None:
+    """More than two standard errors of independent pairs, but zero in half of the scenes."""
+    scenes = np.repeat([0, 1], PAIRS // 2)
+    a = np.zeros(PAIRS)
+    comparison = compare(
+        saved(tmp_path / "a", made_results(), {FDE: a}, scenes),
+        saved(tmp_path / "b", made_results(), {FDE: a + scenes}, scenes),
+    )
+    found = difference(comparison, "FDE-ML 6 s")
+    assert found.difference > 2 * found.standard_error > 0
+    assert found.interval == (0.0, 1.0)
+    assert found.clear is False
+    row = next(line for line in table(comparison).rows if line[1] == "FDE-ML 6 s")
+    assert row[4:] == ("+0.500", "0.167", "+0.000 … +1.000", "10", "no")
+    assert "2000 resamples, seed 0" in table(comparison).note
+
+
+def test_scenes_that_one_run_recorded_serve_both(tmp_path: Path) -> None:
+    """Files of older versions hold none."""
+    comparison = compare(
+        saved(tmp_path / "a", made_results(), {FDE: np.zeros(PAIRS)}),
+        saved(tmp_path / "b", made_results(), {FDE: np.full(PAIRS, 2.0)}, np.arange(PAIRS)),
+    )
+    assert difference(comparison, "FDE-ML 6 s").interval == (2.0, 2.0)
+    assert difference(comparison, "FDE-ML 6 s").clear
+    assert Instances.read(tmp_path / "a", PAIRS).scenes is None
+    np.testing.assert_array_equal(Instances.read(tmp_path / "b", PAIRS).scenes, np.arange(PAIRS))

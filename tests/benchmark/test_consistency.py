@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from benchmark.consistency import METRICS, consistency_metrics
+from benchmark.evaluate import CONSISTENCY, consistency_metrics
 from model.data.scenes import SceneRecord
 from tests.model.data.records import raster, track
 
@@ -20,9 +20,9 @@ def test_true_forecasts_agree_and_converge_at_once() -> None:
     made = np.arange(4, 20)
     paths = np.stack([np.stack([frame + AGES, np.zeros(12)], axis=-1) for frame in made]).astype(float)
     found = consistency_metrics(record, {0: (made, paths)})
-    assert set(found) == set(METRICS)
+    assert set(found) == set(CONSISTENCY)
     # Frames 16 … 19 have a forecast of every age
-    for name in METRICS:
+    for name in CONSISTENCY:
         assert found[name].shape == (4,)
         wanted = 6.0 if name.startswith("convergence") else 0.0
         np.testing.assert_allclose(found[name], wanted, atol=1e-12)

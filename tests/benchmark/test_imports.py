@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-MODULES = ("run", "judge", "submission", "tables", "compare", "report.page")
+MODULES = ("run", "evaluate", "in_process", "submission", "tables", "compare", "report.page")
 FORBIDDEN = (
     "model.networks",
     "model.networks.forecaster",

@@ -2,8 +2,8 @@
 
 import pytest
 
-from benchmark import BenchmarkError
-from benchmark.models import choose, oldest_first
+from benchmark.errors import BenchmarkError
+from benchmark.models import oldest_first, select
 from cab.forecast.v1.model_service_pb2 import (
     AGENT_TYPE_PEDESTRIAN,
     AGENT_TYPE_VEHICLE,
@@ -32,46 +32,46 @@ LISTED = [
 
 def test_all_of_the_protocol_and_the_baselines() -> None:
     causal = ["cab@1.0.0", "cab@1.1.0", "constant-velocity-yaw@1.0.0", "kalman@1.0.0"]
-    assert list(choose(LISTED, Protocol.CAUSAL)) == causal
+    assert list(select(LISTED, Protocol.CAUSAL)) == causal
     paper = ["cab@1.0.0+paper", "constant-velocity-yaw@1.0.0", "kalman@1.0.0", "trajectron@1.0.0"]
-    assert list(choose(LISTED, Protocol.PAPER)) == paper
+    assert list(select(LISTED, Protocol.PAPER)) == paper
 
 
 def test_a_name_is_its_newest_version_of_the_protocol() -> None:
-    assert list(choose(LISTED, Protocol.CAUSAL, ["kalman", "cab"])) == ["kalman@1.0.0", "cab@1.1.0"]
-    assert list(choose(LISTED, Protocol.PAPER, ["cab"])) == ["cab@1.0.0+paper"]
+    assert list(select(LISTED, Protocol.CAUSAL, ["kalman", "cab"])) == ["kalman@1.0.0", "cab@1.1.0"]
+    assert list(select(LISTED, Protocol.PAPER, ["cab"])) == ["cab@1.0.0+paper"]
 
 
 def test_who_is_named_is_judged_whatever_its_protocol() -> None:
-    assert list(choose(LISTED, Protocol.CAUSAL, ["trajectron"])) == ["trajectron@1.0.0"]
-    assert list(choose(LISTED, Protocol.PAPER, ["cab@1.0.0"])) == ["cab@1.0.0"]
+    assert list(select(LISTED, Protocol.CAUSAL, ["trajectron"])) == ["trajectron@1.0.0"]
+    assert list(select(LISTED, Protocol.PAPER, ["cab@1.0.0"])) == ["cab@1.0.0"]
 
 
 def test_who_is_not_there_is_said() -> None:
     with pytest.raises(BenchmarkError, match=r"no model 'fan'; it has cab@1\.0\.0, cab@1\.0\.0"):
-        choose(LISTED, Protocol.CAUSAL, ["fan"])
+        select(LISTED, Protocol.CAUSAL, ["fan"])
     with pytest.raises(BenchmarkError, match="the endpoint has no model of the causal protocol"):
-        choose([model("trajectron", paper=True)], Protocol.CAUSAL)
+        select([model("trajectron", paper=True)], Protocol.CAUSAL)
 
 
 def test_who_forecasts_no_vehicles_is_judged_if_named_alone() -> None:
     walker = model("walker")
     walker.ClearField("agent_types")
     walker.agent_types.append(AGENT_TYPE_PEDESTRIAN)
-    assert "walker@1.0.0" not in choose([*LISTED, walker], Protocol.CAUSAL)
-    assert list(choose([*LISTED, walker], Protocol.CAUSAL, ["walker"])) == ["walker@1.0.0"]
+    assert "walker@1.0.0" not in select([*LISTED, walker], Protocol.CAUSAL)
+    assert list(select([*LISTED, walker], Protocol.CAUSAL, ["walker"])) == ["walker@1.0.0"]
 
 
 def test_who_does_not_forecast_far_enough_is_named_before_anything_is_asked() -> None:
     short = model("short")
     short.horizon = 4.0
     with pytest.raises(BenchmarkError, match=r"short@1\.0\.0: forecasts less than 6 s"):
-        choose([*LISTED, short], Protocol.CAUSAL)
-    assert "cab@1.1.0" in choose([*LISTED, short], Protocol.CAUSAL, ["cab"])
+        select([*LISTED, short], Protocol.CAUSAL)
+    assert "cab@1.1.0" in select([*LISTED, short], Protocol.CAUSAL, ["cab"])
 
 
 def test_versions_are_numbers_and_names_are_names() -> None:
     keys = ["a-b@1.0.0", "a@10.0.0", "a@9.0.0", "a@strange"]
     assert oldest_first(keys) == ["a@strange", "a@9.0.0", "a@10.0.0", "a-b@1.0.0"]
     newest = [model("cab", version) for version in ("1.10.0", "1.9.0")]
-    assert list(choose(newest, Protocol.CAUSAL, ["cab"])) == ["cab@1.10.0"]
+    assert list(select(newest, Protocol.CAUSAL, ["cab"])) == ["cab@1.10.0"]

@@ -22,7 +22,7 @@ import pytest
 
 from benchmark.answers import SceneAnswers, read_answers
 from benchmark.archive import Archive
-from benchmark.models import choose
+from benchmark.models import select
 from benchmark.plan import PlannedScene, plan_scenes
 from benchmark.replay import Replay
 from benchmark.submission import Entry, submission_entries, write_submission
@@ -93,7 +93,7 @@ def ask(dataroot: Path, split: str, folder: Path, models: Sequence[str]) -> Aske
         assert bundled is not None
         learned = load_checkpoint(bundled / LEARNED).forecaster()
         async with running(learned) as server, AsyncClient(f"grpc://{server.grpc_address}") as client:
-            chosen = choose(await client.list_models(), Protocol.CAUSAL, models)
+            chosen = select(await client.list_models(), Protocol.CAUSAL, models)
             with Archive(folder) as archive:
                 replayed = await Replay(scenes, chosen, Protocol.CAUSAL).run(client, archive, lambda _: None)
                 assert not replayed.refused

@@ -7,11 +7,11 @@ from typing import cast
 import numpy as np
 import pytest
 
-from benchmark import BenchmarkError
 from benchmark import replay as replay_module
 from benchmark.archive import Archive
+from benchmark.errors import BenchmarkError
 from benchmark.plan import Call
-from benchmark.replay import Replay, Replayed, keep_the_likeliest
+from benchmark.replay import Replay, Replayed, keep_most_likely
 from cab.forecast.v1.model_service_pb2 import Model
 from cab.forecast.v1.prediction_service_pb2 import AgentForecast, PredictRequest, PredictResponse
 from cab_forecast import (
@@ -67,7 +67,7 @@ def test_every_model_is_asked_every_call_once(tmp_path: Path) -> None:
     asked = [(request.model, request.time, request.agents[0].states[-1].x) for request in endpoint.requests]
     assert len(asked) == len(set(asked)) == 2 * CALLS
     assert endpoint.most == 3
-    assert replayed.asked == sum(ticks) == 2 * FORECASTS
+    assert replayed.requested == sum(ticks) == 2 * FORECASTS
     assert not replayed.refused
 
 
@@ -79,9 +79,9 @@ def test_what_has_its_answer_is_not_asked_again(tmp_path: Path) -> None:
     replayed, ticks = run(tmp_path, endpoint)
     assert len(endpoint.requests) == 2 * CALLS - 20
     assert sum(ticks) == 2 * FORECASTS
-    assert replayed.asked < 2 * FORECASTS
+    assert replayed.requested < 2 * FORECASTS
     endpoint = Endpoint()
-    assert run(tmp_path, endpoint)[0].asked == 0
+    assert run(tmp_path, endpoint)[0].requested == 0
     assert not endpoint.requests
 
 
@@ -114,7 +114,7 @@ def test_a_late_answer_is_asked_for_again(tmp_path: Path) -> None:
 
 
 def test_an_endpoint_that_refuses_everything_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(replay_module, "MOST_REFUSED", 5)
+    monkeypatch.setattr(replay_module, "MAX_REFUSED", 5)
     endpoint = Endpoint({number: BadRequest("no") for number in range(3, 100)})
     with pytest.raises(BenchmarkError, match="the endpoint refuses: no; answers so far are kept"):
         run(tmp_path, endpoint, concurrency=1)
@@ -142,7 +142,7 @@ def test_of_what_is_not_due_the_likeliest_mode_stays() -> None:
             )
         )
     whole = PredictResponse.FromString(response.SerializeToString())
-    keep_the_likeliest(response, Call(4, (0, 1), frozenset({1})), scene)
+    keep_most_likely(response, Call(4, (0, 1), frozenset({1})), scene)
     assert response.forecasts[1] == whole.forecasts[1]
     kept, before = (forecasts(one)[scene.record.tracks[0].id] for one in (response, whole))
     np.testing.assert_array_equal(kept.most_likely, before.most_likely)

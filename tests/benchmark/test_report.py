@@ -134,7 +134,7 @@ def test_a_case_tells_its_errors_the_best_first(whole: str) -> None:
     errors = sorted((forecast.fde_6s_m, key) for key, forecast in case.forecasts.items())
     expected = "; ".join(f"{key} {error:.1f} m" for error, key in errors)
     captions = Page(whole).texts["figcaption"]
-    assert f"The Kalman filter misses by 38.2 m. FDE at 6 s: {expected}." in captions
+    assert f"FDE at 6 s: Kalman filter 38.2 m; {expected}." in captions
 
 
 def test_the_header_says_what_was_asked_of_whom(whole: str) -> None:
@@ -173,7 +173,7 @@ def test_no_model_has_a_forecast(tmp_path: Path) -> None:
     nothing = replace(made_model(metrics={"ade_ml_1s_m": math.nan}), statuses={"MISSING": 10}, latency=None)
     page = Page(write_page(made_results(nothing), [], tmp_path).read_text(encoding="utf-8"))
     assert page.pictures() == []
-    assert "8. How pairs came out" in page.texts["h2"]
+    assert "8. Forecast statuses" in page.texts["h2"]
 
 
 @pytest.mark.parametrize(("protocol", "lines"), [(Protocol.CAUSAL, 1), (Protocol.PAPER, 3)])
@@ -238,7 +238,7 @@ def test_the_likelier_mode_is_the_stronger_line() -> None:
 def test_a_forecast_that_goes_far_does_not_make_everything_tiny() -> None:
     case = made_case()
     forecast = case.forecasts["cab@1.0.0"]
-    runaway = replace(forecast, likeliest=forecast.likeliest + np.linspace(0, 900, 12)[:, None])
+    runaway = replace(forecast, most_likely=forecast.most_likely + np.linspace(0, 900, 12)[:, None])
     axes = case_map(replace(case, forecasts={"cab@1.0.0": runaway}), styles(case.forecasts)).axes[0]
     (left, right), (truth, _) = axes.get_xlim(), case.truth[-1]
     assert right - left < 220

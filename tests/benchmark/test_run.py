@@ -2,31 +2,32 @@
 
 import asyncio
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmark import BenchmarkError
 from benchmark.archive import Archive
-from benchmark.judge import Judged
-from benchmark.models import BASELINES, choose
+from benchmark.errors import BenchmarkError
+from benchmark.evaluate import Evaluated
+from benchmark.models import BASELINES, select
 from benchmark.replay import Replayed
-from benchmark.results import Results
-from benchmark.run import Benchmark, listed_models
-from benchmark.score import Judging
+from benchmark.results import BenchmarkResults
+from benchmark.run import IN_PROCESS, Benchmark, Endpoint, Progress, listed_models, run_benchmark
 from benchmark.tables import markdown
 from cab.forecast.v1.model_service_pb2 import Model
 from cab.forecast.v1.prediction_service_pb2 import FORECAST_STATUS_FALLBACK
 from cab_forecast import AsyncClient
-from model.evaluation import subjects
+from model.evaluation import selection
 from model.evaluation.run import Evaluation
 from model.forecaster import Protocol
 from model.metrics.density import DRAWS
 from model.metrics.oracle import ORACLE, PHYSICS
+from model.metrics.pairs import Sampling
 from service.server import Server
 from tests.benchmark.scenes import PAIRS, READER
 from tests.model.evaluation.builders import checkpoints
@@ -50,28 +51,29 @@ def server(models: Path) -> Iterator[Server]:
 
 def made(folder: Path, protocol: Protocol = Protocol.CAUSAL, limit: int | None = None) -> Benchmark:
     """A benchmark on made-up scenes."""
-    judging = Judging(SAMPLES, DRAWS, 0, consistency=True)
-    return Benchmark("made", READER, "some", protocol, folder, judging, limit)
+    return Benchmark("made", READER, "some", protocol, folder, Sampling(SAMPLES, DRAWS), limit=limit)
 
 
-def ask(whole: Benchmark, endpoint: str, *names: str) -> dict[str, Model]:
-    """Asks whatever has no answer yet; who was asked."""
+def ask(whole: Benchmark, address: str, *names: str) -> dict[str, Model]:
+    """Models that were asked for all forecasts without a saved answer."""
 
     async def go() -> dict[str, Model]:
-        async with AsyncClient(endpoint, timeout=30, retries=1000) as client:
-            chosen = choose(await listed_models(client), whole.protocol, names)
-            await whole.ask(client, endpoint, whole.replay(chosen, 4, 30), lambda done: None)
+        async with AsyncClient(address, timeout=30, retries=1000) as client:
+            chosen = select(await listed_models(client), whole.protocol, names)
+            await whole.replay(client, Endpoint(address, None, 4, 30), chosen)
             return chosen
 
     return asyncio.run(go())
 
 
-def judge(whole: Benchmark, chosen: dict[str, Model], processes: int = 1) -> tuple[Results, Judged]:
-    """Judges what is saved."""
-    return whole.judge(chosen, processes, lambda pairs: None)
+def evaluated(
+    whole: Benchmark, chosen: dict[str, Model], processes: int = 1
+) -> tuple[BenchmarkResults, Evaluated]:
+    """Evaluation of the saved answers."""
+    return whole.evaluate(chosen, processes)
 
 
-def same(one: Results, other: Results) -> None:
+def same(one: BenchmarkResults, other: BenchmarkResults) -> None:
     """Everything is equal but what the clock told."""
     for left, right in zip(one.models, other.models, strict=True):
         assert left.key == right.key
@@ -87,14 +89,14 @@ def test_online_equals_offline(
     address = server.grpc_address if transport == "grpc" else server.http_address
     whole = made(tmp_path, protocol)
     chosen = ask(whole, f"{transport}://{address}")
-    results, _ = judge(whole, chosen)
+    results, _ = evaluated(whole, chosen)
     assert results.missing == 0
     assert {model.name for model in results.models} >= {*BASELINES, ORACLE, "cab"}
     offline = Evaluation(
-        subjects.choose(models, protocol), "made", READER, "some", protocol, tmp_path / "cache", SAMPLES
+        selection.select(models, protocol), "made", READER, "some", protocol, tmp_path / "cache", SAMPLES
     )(lambda *_: None, lambda _: None)
     assert results.pairs == offline.pairs == PAIRS
-    rows = {f"{row.name}@{row.version}" if row.version else row.name: row for row in offline.rows}
+    rows = {row.key: row for row in offline.models}
     assert {model.key for model in results.models} == set(rows)
     for model in results.models:
         for name, value in rows[model.key].metrics.items():
@@ -104,7 +106,7 @@ def test_online_equals_offline(
 
 def test_what_a_run_tells(tmp_path: Path, server: Server) -> None:
     whole = made(tmp_path)
-    results, judged = judge(whole, ask(whole, f"grpc://{server.grpc_address}"))
+    results, found = evaluated(whole, ask(whole, f"grpc://{server.grpc_address}"))
     by_name = {model.name: model for model in results.models}
     cab, kalman, oracle = by_name["cab"], by_name["kalman"], by_name[ORACLE]
     assert sum(cab.statuses.values()) == PAIRS
@@ -117,15 +119,17 @@ def test_what_a_run_tells(tmp_path: Path, server: Server) -> None:
     physics = [by_name[name].metrics["ade_ml_6s_m"] for name in PHYSICS]
     assert oracle.metrics["ade_ml_6s_m"] < min(physics)
     # The hardest are those that Kalman misses most
-    assert judged.mismatch_m is not None
-    assert kalman.metrics["fde_hardest_1_m"] == judged.mismatch_m.max()
+    assert found.mismatch_m is not None
+    assert kalman.metrics["fde_hardest_1_m"] == found.mismatch_m.max()
     assert kalman.metrics["fde_hardest_all_m"] == pytest.approx(kalman.metrics["fde_ml_6s_m"])
-    assert judged.each["cab@1.0.0/fde_ml_6s_m"].mean() == pytest.approx(cab.metrics["fde_ml_6s_m"])
-    cases = whole.hard_cases([cab.key], judged.mismatch_m)
-    assert cases[0].mismatch_m == judged.mismatch_m.max()
+    assert found.instances.figures["cab@1.0.0/fde_ml_6s_m"].mean() == pytest.approx(
+        cab.metrics["fde_ml_6s_m"]
+    )
+    cases = whole.hard_cases([cab.key], found.mismatch_m)
+    assert cases[0].mismatch_m == found.mismatch_m.max()
     assert [case.mismatch_m for case in cases] == sorted((case.mismatch_m for case in cases), reverse=True)
     assert len({(case.scene, case.agent) for case in cases}) == len(cases) == 6
-    hardest = int(judged.mismatch_m.argmax())
+    hardest = int(found.mismatch_m.argmax())
     scene = next(scene for scene in whole.scenes if scene.first <= hardest < scene.first + len(scene.pairs))
     np.testing.assert_array_equal(cases[0].truth, scene.truth()[hardest - scene.first])
     np.testing.assert_array_equal(cases[0].history[-1], scene.origin()[hardest - scene.first])
@@ -133,18 +137,18 @@ def test_what_a_run_tells(tmp_path: Path, server: Server) -> None:
 
 def test_what_is_saved_gives_the_same_again(tmp_path: Path, server: Server) -> None:
     whole = made(tmp_path)
-    results, _ = judge(whole, ask(whole, f"grpc://{server.grpc_address}"))
+    results, _ = evaluated(whole, ask(whole, f"grpc://{server.grpc_address}"))
     again = made(tmp_path)
-    same(results, judge(again, again.saved_models(), processes=2)[0])
-    some, _ = judge(again, again.saved_models(["kalman"]))
+    same(results, evaluated(again, again.saved_models(), processes=2)[0])
+    some, _ = evaluated(again, again.saved_models(["kalman"]))
     assert [model.key for model in some.models] == ["kalman@1.0.0"]
 
 
 def test_another_seed_draws_others(tmp_path: Path, server: Server) -> None:
     whole = made(tmp_path)
     chosen = ask(whole, f"grpc://{server.grpc_address}", "cab")
-    other = replace(whole, judging=replace(whole.judging, seed=1))
-    first, second = (judge(one, chosen)[0].models[0].metrics for one in (whole, other))
+    other = replace(whole, sampling=replace(whole.sampling, seed=1))
+    first, second = (evaluated(one, chosen)[0].models[0].metrics for one in (whole, other))
     assert first["fde_ml_6s_m"] == second["fde_ml_6s_m"]
     assert first["fde_f_6s_m"] != second["fde_f_6s_m"]
 
@@ -155,17 +159,17 @@ def test_a_server_that_restarts_midway_loses_nothing(tmp_path: Path, models: Pat
 
     async def go(endpoint: str) -> tuple[dict[str, Model], Replayed]:
         asked = 0
+        chosen: dict[str, Model] = {}
 
         def tick(done: int) -> None:
             nonlocal asked
             asked += done
-            if asked > replay.forecasts() // 3:
+            if asked > len(chosen) * whole.forecasts // 3:
                 halfway.set()
 
         async with AsyncClient(endpoint, timeout=60, retries=1000) as client:
-            chosen = choose(await listed_models(client), whole.protocol)
-            replay = whole.replay(chosen, 4, 60)
-            return chosen, await whole.ask(client, endpoint, replay, tick)
+            chosen |= select(await listed_models(client), whole.protocol)
+            return chosen, await whole.replay(client, Endpoint(endpoint, None, 4, 60), chosen, tick)
 
     with ThreadPoolExecutor(1) as pool:
         with in_thread(settings(models=models)) as first:
@@ -176,7 +180,7 @@ def test_a_server_that_restarts_midway_loses_nothing(tmp_path: Path, models: Pat
         with in_thread(settings(models=models, grpc=address)):
             chosen, replayed = asking.result(120)
     assert not replayed.refused
-    results, _ = judge(whole, chosen)
+    results, _ = evaluated(whole, chosen)
     assert results.missing == 0
     assert all(sum(model.statuses.values()) == PAIRS for model in results.models if model.version)
 
@@ -195,7 +199,7 @@ def test_an_instance_without_an_answer_is_missed(tmp_path: Path, server: Server)
     lost = whole.scenes[1].calls[0]
     with Archive(tmp_path) as archive:
         archive._file.execute("DELETE FROM answers WHERE scene = 'scene-2' AND frame = ?", (lost.frame,))
-    results, _ = judge(whole, chosen)
+    results, _ = evaluated(whole, chosen)
     assert results.missing == 2 * len(lost.due) > 0
     assert results.models[0].lost == 0
     assert results.models[0].statuses["MISSING"] == len(lost.due)
@@ -205,13 +209,13 @@ def test_an_instance_without_an_answer_is_missed(tmp_path: Path, server: Server)
 def test_a_forecast_for_dispersion_alone_is_missed_too(tmp_path: Path, server: Server) -> None:
     whole = made(tmp_path)
     chosen = ask(whole, f"grpc://{server.grpc_address}", "kalman")
-    whole_instants = judge(whole, chosen)[0].models[0].instants
+    whole_instants = evaluated(whole, chosen)[0].models[0].instants
     lost = whole.scenes[0].calls[-1]
     assert not lost.due
     with Archive(tmp_path) as archive:
         archive._file.execute("DELETE FROM answers WHERE scene = 'scene-1' AND frame = ?", (12,))
         archive._file.execute("DELETE FROM answers WHERE scene = 'scene-1' AND frame = ?", (lost.frame,))
-    (kalman,) = judge(whole, chosen)[0].models
+    (kalman,) = evaluated(whole, chosen)[0].models
     assert kalman.statuses.get("MISSING", 0) == 0
     assert kalman.missing == kalman.lost > len(lost.tracks)
     assert kalman.instants < whole_instants
@@ -228,7 +232,7 @@ def test_the_fallbacks_of_a_model_are_said(tmp_path: Path, server: Server) -> No
                 for forecast in answer.response.forecasts:
                     forecast.status = FORECAST_STATUS_FALLBACK
                 archive.add("kalman@1.0.0", scene.record.name, call, answer)
-    results, _ = judge(whole, chosen)
+    results, _ = evaluated(whole, chosen)
     assert results.models[0].fallbacks == PAIRS
     assert f"kalman@1.0.0 ({PAIRS} of {PAIRS} by a fallback)" in markdown(results)
 
@@ -241,3 +245,68 @@ def test_nobody_at_the_endpoint(tmp_path: Path) -> None:
 async def _list(endpoint: str) -> list[Model]:
     async with AsyncClient(endpoint, timeout=1, retries=0) as client:
         return await listed_models(client)
+
+
+class Recorder(Progress):
+    """Keeps what it receives."""
+
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+        self.steps: dict[str, int] = {}
+        self.totals: dict[str, int] = {}
+
+    def note(self, text: str) -> None:
+        self.notes.append(text)
+
+    @contextmanager
+    def task(self, name: str, total: int | None = None, unit: str = "") -> Iterator[Callable[[int], None]]:
+        self.totals[name], self.steps[name] = total or 0, 0
+
+        def tick(steps: int) -> None:
+            self.steps[name] += steps
+
+        yield tick
+
+
+FILES = {"answers.sqlite", "results.json", "tables.md", "instances.npz", "benchmark.yml", "report.html"}
+
+
+def test_one_call_runs_a_whole_benchmark_in_process(tmp_path: Path, server: Server, models: Path) -> None:
+    """Its figures are those of an endpoint with the same models."""
+    chosen = selection.select(models, Protocol.CAUSAL)
+    forecasters = [*chosen.baselines, *(one.forecaster for one in chosen.learned)]
+    progress = Recorder()
+    local = run_benchmark(made(tmp_path / "local"), forecasters, tmp_path / "local", progress=progress)
+    address = Endpoint(f"grpc://{server.grpc_address}", concurrency=4, timeout=30)
+    remote = run_benchmark(made(tmp_path / "remote"), address, tmp_path / "remote")
+    for folder, run in (("local", local), ("remote", remote)):
+        submissions = {f"submission-{model.key}.json" for model in run.results.models if model.version}
+        assert {file.name for file in (tmp_path / folder).iterdir()} == FILES | submissions
+        assert {file.name for file in run.files} == {"report.html"} | submissions
+    assert local.results.endpoint == IN_PROCESS
+    assert local.results.missing == remote.results.missing == 0
+    assert {one.key for one in local.results.models} == {one.key for one in remote.results.models}
+    theirs = {one.key: one for one in remote.results.models}
+    for model in local.results.models:
+        other = theirs[model.key]
+        assert (model.protocol, model.trained_on) == (other.protocol, other.trained_on)
+        assert (model.statuses, model.instants) == (other.statuses, other.instants)
+        assert model.metrics.keys() == other.metrics.keys()
+        for name, value in model.metrics.items():
+            approx = pytest.approx(other.metrics[name], rel=1e-4, abs=1e-4, nan_ok=True)
+            assert value == approx, (model.key, name)
+    assert progress.steps == progress.totals
+    assert set(progress.steps) == {"reading the data", f"running {len(forecasters)} models", "evaluating"}
+    assert any(note.startswith("requested ") for note in progress.notes)
+
+
+def test_saved_answers_of_this_process_are_not_made_again(tmp_path: Path, models: Path) -> None:
+    kalman = selection.select(models, Protocol.CAUSAL, ["kalman"]).baselines
+    first = run_benchmark(made(tmp_path / "run"), kalman, tmp_path / "run")
+    progress = Recorder()
+    second = run_benchmark(made(tmp_path / "run"), kalman, tmp_path / "again", progress=progress)
+    assert any(note.startswith("requested 0 forecasts") for note in progress.notes)
+    third = run_benchmark(made(tmp_path / "run"), None, tmp_path / "saved", names=["kalman"], processes=2)
+    assert first.results == second.results == third.results
+    with pytest.raises(BenchmarkError, match="this process has no model 'cab'; it has kalman"):
+        run_benchmark(made(tmp_path / "run"), kalman, tmp_path / "run", names=["cab"])

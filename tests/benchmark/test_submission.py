@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from benchmark import BenchmarkError
 from benchmark.answers import CallTimes, SceneAnswers
+from benchmark.errors import BenchmarkError
 from benchmark.plan import PlannedScene
 from benchmark.submission import MAX_MODES, Entry, submission_entries, write_submission
 from model.arrays import Floats

@@ -3,8 +3,8 @@ from dataclasses import replace
 
 import pytest
 
-from benchmark.tables import label, left_out, markdown, tables
-from model.evaluation.text_tables import Table
+from benchmark.tables import left_out, markdown, tables
+from model.evaluation.tables import Table
 from model.forecaster import Protocol
 from tests.benchmark.builders import all_models, made_metrics, made_model, made_oracle, made_results
 
@@ -66,7 +66,7 @@ def test_figures_stand_in_their_columns() -> None:
             *("0.40", "0.20", "1.20", "0.60", "0.10", "0.05", "1.45", "3.00", "3.25", "0.62", "2.75", "7.00"),
         ),
     )
-    moving = cells(titled(made, "Without those that stood"))
+    moving = cells(titled(made, "Without standing agents"))
     assert (moving["FDE"], moving["minADE_5, raw"], moving["minADE_5, merged"]) == ("7.27", "0.61", "0.40")
     assert (moving["OffR-f"], moving["hold 90 %, median"]) == ("0.25", "4.00")
     likely = cells(titled(made, "Likelihood"))
@@ -78,10 +78,10 @@ def test_latency_is_in_milliseconds_and_has_no_oracle() -> None:
     assert table.rows == (("cab@1.0.0", "40", "12.3", "34.5", "98.7", "1.1", "5.5", "7.2"),)
 
 
-def test_how_pairs_came_out() -> None:
+def test_pairs_by_status() -> None:
     odd = replace(made_model("odd"), statuses={"FALLBACK": 3, "SURPRISING": 7})
     some_lost = replace(made_model(), lost=2)
-    table = titled(tables(made_results(some_lost, odd)), "How pairs")
+    table = titled(tables(made_results(some_lost, odd)), "statuses")
     assert cells(table) == {
         "model": "cab@1.0.0",
         "OK": "9",
@@ -107,7 +107,7 @@ def test_how_pairs_came_out() -> None:
 )
 def test_a_row_tells_of_states_unlike_the_training(protocol: str, inputs: Protocol, expected: str) -> None:
     model = made_model(protocol=protocol)
-    assert label(model, inputs) == expected
+    assert model.label(inputs) == expected
     assert all(table.rows[0][0] == expected for table in tables(made_results(model, protocol=inputs)))
 
 
@@ -126,8 +126,8 @@ def test_the_papers_dispersion_stands_beside_both_forms() -> None:
     assert table.columns == ("model", "whose", "D, std", "D, mean", "C(0.2 m)", "C(1 m)", "C(5 m)")
     assert table.rows[1][2:] == ("2.61", "2.61", "1.12", "2.45", "4.74")
     assert table.rows[2][2:4] == ("-0.61", "+0.39")
-    assert "stands beside both" in table.note
-    assert "stands beside both" not in titled(tables(made_results()), "7.3").note
+    assert "compared with both" in table.note
+    assert "compared with both" not in titled(tables(made_results()), "7.3").note
 
 
 def test_the_papers_hard_cases_stand_beside_ours() -> None:
@@ -147,8 +147,11 @@ def test_a_table_with_nothing_to_say_is_left_out_and_says_why() -> None:
     assert [table.title[0] for table in tables(results)] == ["1", "4", "4", "4", "5"]
     reasons = left_out(results)
     assert len(reasons) == 7
-    assert "2. Dispersion and convergence: left out: dispersion and convergence were not asked for" in reasons
-    ranking = "kalman, whose mistakes rank the pairs, was not among the models"
+    assert (
+        "2. Dispersion and convergence: left out: forecasts for dispersion and convergence were not requested"
+        in reasons
+    )
+    ranking = "kalman, whose errors rank the pairs, was not among the models"
     assert f"3. Hard cases: left out: {ranking}" in reasons
     assert any(reason.startswith("6. Latency: left out") for reason in reasons)
     assert all(f"- {reason}" in markdown(results) for reason in reasons)

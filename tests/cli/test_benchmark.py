@@ -15,7 +15,7 @@ import pytest
 from typer.testing import CliRunner
 
 from benchmark.archive import FILE
-from benchmark.rules import RULES_FILE
+from benchmark.prometheus_rules import RULES_FILE
 from cli.main import app
 from model.data.sources import READERS, parse_data
 from service.server import Server
@@ -174,7 +174,7 @@ def test_data_with_tokens_gives_submissions_of_who_answered_it_all(
     assert "forecasts are missing" in said
     assert [one.name for one in again.glob("submission-*")] == ["submission-kalman@1.0.0.json"]
     assert (again / "report.html").is_file()
-    assert "8. How pairs came out" in shown
+    assert "8. Forecast statuses" in shown
 
 
 @pytest.mark.parametrize(

@@ -44,7 +44,7 @@ def test_all_models_are_judged_written_and_shown(tmp_path: Path) -> None:
     assert rows["cab"]["ablated"].keys() == {"map", "neighbors", "both"}
     assert rows["trajectron-no-context"]["ablated"] == {}
     tables = (tmp_path / "out/tables.md").read_text()
-    for word in ("causal protocol", "split some", f"{PAIRS} pairs", "5 sampled", "context matter"):
+    for word in ("causal protocol", "split some", f"{PAIRS} pairs", "5 sampled", "Context ablation"):
         assert word in tables
         assert word in shown
     # Again, from the cache: bit-equal

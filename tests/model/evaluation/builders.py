@@ -5,7 +5,7 @@ from pathlib import Path
 import torch
 
 from model.checkpoint import save_checkpoint
-from model.evaluation.results import Results, Row
+from model.evaluation.results import EvaluationModelResult, EvaluationResults
 from model.forecaster import Protocol
 from model.networks.config import BlindContext, CoverNetConfig, NetworkConfig
 from model.networks.forecaster import CoverNetworks
@@ -40,11 +40,21 @@ def checkpoints(folder: Path) -> Path:
     return folder
 
 
-def row(name: str, learned: bool = True, version: str = "1.0.0", **figures: float) -> Row:
-    """A row of few figures."""
-    return Row(name, version, learned, "", figures)
+def row(name: str, learned: bool = True, version: str = "1.0.0", **figures: float) -> EvaluationModelResult:
+    """A model with few figures."""
+    return EvaluationModelResult(name=name, version=version, learned=learned, trained_on="", metrics=figures)
 
 
-def results(*rows: Row, ablate: bool = False, samples: int = 200) -> Results:
+def results(*rows: EvaluationModelResult, ablate: bool = False, samples: int = 200) -> EvaluationResults:
     """Results on ten pairs."""
-    return Results("made", "some", Protocol.CAUSAL, 10, None, samples, 199, ablate, rows)
+    return EvaluationResults(
+        data="made",
+        split="some",
+        protocol=Protocol.CAUSAL,
+        pairs=10,
+        limit=None,
+        samples=samples,
+        draws=199,
+        ablate=ablate,
+        models=rows,
+    )

@@ -11,14 +11,17 @@ from model.data.cache import Cache
 from model.data.cache_builder import build_cache
 from model.data.protocols import frame_scene
 from model.data.scenes import DataError, Pair, SceneRecord
-from model.evaluation.baselines import judge_baselines, scene_pairs
+from model.evaluation.in_process import evaluate_baselines, scene_features
+from model.evaluation.pairs import split_pairs
 from model.forecaster import Protocol
 from model.metrics.evaluate import instance_metrics
 from model.metrics.oracle import ORACLE, PHYSICS, oracle_mixture
+from model.metrics.pairs import Sampling
 from model.networks.config import NetworkConfig
 from tests.model.data.records import FixedReader, raster, record, track
 
 READER = FixedReader(record(), record("scene-2", seed=1))
+NO_DRAWS = Sampling(0, 0)
 COVARIANCES = torch.eye(2).expand(2, 2, 2, 2)
 
 
@@ -46,17 +49,18 @@ def test_the_oracle_chooses_for_each_pair_by_hand() -> None:
 def test_pairs_come_in_the_order_of_the_cache(tmp_path: Path) -> None:
     build_cache(READER, "some", Protocol.CAUSAL, NetworkConfig(), 5, tmp_path / "cache")
     cache = Cache.open(tmp_path / "cache")
-    scenes = list(scene_pairs(READER, "some", Protocol.CAUSAL, [Kalman()]))
-    truth = np.concatenate([scene.truth for scene in scenes])
+    scenes = list(split_pairs(READER, "some"))
+    truth = np.concatenate([scene.evaluated().truth for scene in scenes])
     np.testing.assert_allclose(truth, cache.future + cache.position[:, None], atol=1e-4)
-    origin = np.concatenate([scene.features[0]["origin"].numpy() for scene in scenes])
+    features = [scene_features(scene, Protocol.CAUSAL, [Kalman()])[0] for scene in scenes]
+    origin = np.concatenate([one["origin"].numpy() for one in features])
     np.testing.assert_array_equal(origin, cache.position)
 
 
 @pytest.mark.parametrize("protocol", Protocol)
 def test_figures_are_the_means_over_single_forecasts(protocol: Protocol) -> None:
     kalman = Kalman()
-    means = judge_baselines(READER, "some", protocol, [kalman], False, 10, 9)
+    means = evaluate_baselines(READER, "some", protocol, [kalman], False, Sampling(10, 9))
     parts: dict[str, list[float]] = {}
     number = 0
     for one in READER.scenes("some"):
@@ -81,7 +85,7 @@ def test_figures_are_the_means_over_single_forecasts(protocol: Protocol) -> None
 
 
 def test_the_oracle_is_no_worse_than_any_and_states_no_density() -> None:
-    means = judge_baselines(READER, "some", Protocol.CAUSAL, physics.baselines(), True, 0, 0)
+    means = evaluate_baselines(READER, "some", Protocol.CAUSAL, physics.baselines(), True, NO_DRAWS)
     oracle = means.pop(ORACLE).means()
     assert {name.partition("@")[0] for name in means} == set(PHYSICS)
     assert all(oracle["ade_ml_6s_m"] <= one.mean("ade_ml_6s_m") for one in means.values())
@@ -100,7 +104,9 @@ def straight() -> SceneRecord:
 
 
 def test_a_car_that_goes_straight_on_is_foreseen() -> None:
-    means = judge_baselines(FixedReader(straight()), "some", Protocol.CAUSAL, physics.baselines(), True, 0, 0)
+    means = evaluate_baselines(
+        FixedReader(straight()), "some", Protocol.CAUSAL, physics.baselines(), True, NO_DRAWS
+    )
     for one in means.values():
         assert one.mean("fde_ml_6s_m") == pytest.approx(0, abs=1e-4)
         assert one.count("fde_ml_6s_m") == 2
@@ -109,15 +115,15 @@ def test_a_car_that_goes_straight_on_is_foreseen() -> None:
 def test_a_limit_takes_the_first_pairs() -> None:
     done: list[int] = []
     first = len(record().pairs)
-    means = judge_baselines(
-        READER, "some", Protocol.CAUSAL, [Kalman()], False, 0, 0, first + 3, tick=done.append
+    means = evaluate_baselines(
+        READER, "some", Protocol.CAUSAL, [Kalman()], False, NO_DRAWS, first + 3, tick=done.append
     )
     assert done == [first, first + 3]
     assert means["kalman@1.0.0"].count("ade_ml_6s_m") == first + 3
-    judge_baselines(READER, "some", Protocol.CAUSAL, [Kalman()], False, 0, 0, first, tick=done.append)
+    evaluate_baselines(READER, "some", Protocol.CAUSAL, [Kalman()], False, NO_DRAWS, first, tick=done.append)
     assert done[2:] == [first]
 
 
 def test_a_split_without_pairs() -> None:
     with pytest.raises(DataError, match="'none' has no pairs"):
-        judge_baselines(READER, "none", Protocol.CAUSAL, [Kalman()], False, 0, 0)
+        evaluate_baselines(READER, "none", Protocol.CAUSAL, [Kalman()], False, NO_DRAWS)

@@ -4,15 +4,15 @@ import pytest
 
 from model.data.scenes import DataError
 from model.evaluation.run import Evaluation, write_results
-from model.evaluation.subjects import choose
+from model.evaluation.selection import select
 from model.forecaster import Protocol
 from tests.model.data.records import FixedReader, record
 from tests.model.evaluation.builders import checkpoints
 
 
 def evaluation(folder: Path, reader: FixedReader) -> Evaluation:
-    subjects = choose(checkpoints(folder / "models"), Protocol.CAUSAL, ["cab", "kalman"])
-    return Evaluation(subjects, "made", reader, "some", Protocol.CAUSAL, folder / "cache", samples=0)
+    models = select(checkpoints(folder / "models"), Protocol.CAUSAL, ["cab", "kalman"])
+    return Evaluation(models, "made", reader, "some", Protocol.CAUSAL, folder / "cache", samples=0)
 
 
 def test_what_goes_on_is_told(tmp_path: Path) -> None:
@@ -24,7 +24,7 @@ def test_what_goes_on_is_told(tmp_path: Path) -> None:
     pairs = len(record().pairs)
     assert ticks == [("cab", pairs), ("baselines", pairs)]
     assert len(said) == 1
-    assert [row.name for row in results.rows] == ["kalman", "cab"]
+    assert [row.name for row in results.models] == ["kalman", "cab"]
     write_results(results, tmp_path / "new/out")
     assert {file.name for file in (tmp_path / "new/out").iterdir()} == {"results.json", "tables.md"}
 

@@ -6,14 +6,14 @@ from typing import Any
 
 import yaml
 
-from benchmark.results import Results
-from benchmark.rules import RULES_FILE, rules
+from benchmark.prometheus_rules import RULES_FILE, rules
+from benchmark.results import BenchmarkResults
 from model.forecaster import Protocol
 from tests.benchmark.builders import made_metrics, made_model, made_oracle, made_results
 from tests.deploy.files import PROMETHEUS, read_yaml
 
 
-def read(results: Results) -> list[dict[str, Any]]:
+def read(results: BenchmarkResults) -> list[dict[str, Any]]:
     [group] = yaml.safe_load(rules(results))["groups"]
     assert group["name"] == "benchmark"
     found: list[dict[str, Any]] = group["rules"]

@@ -6,35 +6,42 @@ import pytest
 
 from model.data.protocols import frame_scene
 from model.evaluation.ablation import Without
-from model.evaluation.learned import Judged, judge_learned, open_validations
-from model.evaluation.subjects import Learned, choose
+from model.evaluation.in_process import ModelMeans, evaluate_checkpoints, open_validations
+from model.evaluation.selection import Learned, select
 from model.forecaster import Protocol
 from model.metrics.evaluate import instance_metrics
+from model.metrics.pairs import Sampling
 from model.training import validation
 from tests.model.data.records import FixedReader, record
 from tests.model.evaluation.builders import checkpoints, save_covernet
 
 READER = FixedReader(record(), record("scene-2", seed=1))
+NO_DRAWS = Sampling(0, 0)
 
 
-def judge(folder: Path, models: tuple[Learned, ...], **options: bool | int) -> dict[str, Judged]:
+def evaluate(
+    folder: Path,
+    models: tuple[Learned, ...],
+    sampling: Sampling = NO_DRAWS,
+    ablate: bool = False,
+    limit: int | None = None,
+) -> dict[str, ModelMeans]:
     """On one cache for all of them."""
     said: list[str] = []
     ((found, group),) = open_validations(models, folder, READER, "made", "some", Protocol.CAUSAL, said.append)
     assert group == list(models)
-    values = {"ablate": False, "samples": 0, "draws": 0} | options
-    return judge_learned(found, models, **values)  # type: ignore[arg-type]
+    return evaluate_checkpoints(found, models, ablate, sampling, limit)
 
 
 @pytest.fixture
 def models(tmp_path: Path) -> tuple[Learned, ...]:
     """cab and trajectron-no-context of random weights."""
-    return choose(checkpoints(tmp_path / "models"), Protocol.CAUSAL).learned
+    return select(checkpoints(tmp_path / "models"), Protocol.CAUSAL).learned
 
 
 def test_figures_are_those_of_forecasts_from_the_scene(tmp_path: Path, models: tuple[Learned, ...]) -> None:
     """A cache's features and patches are those that a server makes of the scene."""
-    judged = judge(tmp_path, models, samples=8, draws=9)
+    judged = evaluate(tmp_path, models, Sampling(8, 9))
     for model in models:
         fde: list[float] = []
         off_road: list[float] = []
@@ -57,9 +64,9 @@ def test_figures_are_those_of_forecasts_from_the_scene(tmp_path: Path, models: t
 def test_batches_make_no_difference(
     tmp_path: Path, models: tuple[Learned, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = judge(tmp_path, models, samples=8, draws=9)
+    whole = evaluate(tmp_path, models, Sampling(8, 9))
     monkeypatch.setattr(validation, "BATCH", 7)
-    cut = judge(tmp_path, models, samples=8, draws=9)
+    cut = evaluate(tmp_path, models, Sampling(8, 9))
     for name, one in whole.items():
         for metric, value in one.metrics.means().items():
             assert cut[name].metrics.mean(metric) == pytest.approx(value, rel=1e-4, abs=1e-4), metric
@@ -76,14 +83,14 @@ def test_a_cache_tells_who_stood_as_the_scene_does(tmp_path: Path, models: tuple
     ((found, _),) = open_validations(
         models, tmp_path, FixedReader(scene), "made", "some", Protocol.CAUSAL, lambda said: None
     )
-    np.testing.assert_array_equal(np.concatenate([batch.stood for batch in found.batches()]), expected)
-    means = judge_learned(found, models, ablate=False, samples=0, draws=0)["cab@1.0.0"].metrics
+    np.testing.assert_array_equal(np.concatenate([batch.pairs.stood for batch in found.batches()]), expected)
+    means = evaluate_checkpoints(found, models, False, NO_DRAWS)["cab@1.0.0"].metrics
     assert means.count("moving_fde_ml_6s_m") == means.count("fde_ml_6s_m") - 4
     assert means.figures()["merged_modes_90_median"] in (1, 1.5, 2, 2.5, 3)
 
 
 def test_ablation_judges_what_a_model_looks_at(tmp_path: Path, models: tuple[Learned, ...]) -> None:
-    judged = judge(tmp_path, models, ablate=True, limit=20)
+    judged = evaluate(tmp_path, models, ablate=True, limit=20)
     cab, alone = judged["cab@1.0.0"], judged["trajectron-no-context@1.0.0"]
     assert set(cab.ablated) == set(Without)
     assert not alone.ablated
@@ -94,7 +101,7 @@ def test_ablation_judges_what_a_model_looks_at(tmp_path: Path, models: tuple[Lea
 
 def test_covernet_has_a_cache_of_its_own(tmp_path: Path) -> None:
     save_covernet(checkpoints(tmp_path / "models") / "covernet")
-    models = choose(tmp_path / "models", Protocol.CAUSAL).learned
+    models = select(tmp_path / "models", Protocol.CAUSAL).learned
     said: list[str] = []
     opened = list(open_validations(models, tmp_path, READER, "made", "some", Protocol.CAUSAL, said.append))
     assert [[one.info.name for one in group] for _, group in opened] == [
@@ -102,7 +109,7 @@ def test_covernet_has_a_cache_of_its_own(tmp_path: Path) -> None:
         ["covernet"],
     ]
     (found, group) = opened[1]
-    judged = judge_learned(found, group, ablate=True, samples=0, draws=0)["covernet@1.0.0"]
+    judged = evaluate_checkpoints(found, group, True, NO_DRAWS)["covernet@1.0.0"]
     assert set(judged.ablated) == set(Without)
     nll = {one.mean("nll") for one in (judged.metrics, *judged.ablated.values())}
     assert len(nll) == 4  # the boxes, too, are taken away

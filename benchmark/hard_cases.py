@@ -1,4 +1,4 @@
-"""Hard cases: the pairs that the Kalman filter mistakes most (table 3), and what models made of them."""
+"""Hard cases: the pairs with the largest errors of the Kalman filter (table 3), and their forecasts."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,25 +12,25 @@ from model.mixture import TrajectoryMixture
 from model.scenes.scene import Raster
 
 SHOWN = 6
-"""Hard cases that a report draws."""
+"""Number of hard cases in a report."""
 
 
 @dataclass(frozen=True)
 class CaseForecast:
-    """What one model forecast."""
+    """Forecast of one model."""
 
     weights: Floats
     """[K]"""
     modes: Floats
     """[K, T, 2], m, ground frame."""
-    likeliest: Floats
+    most_likely: Floats
     """[T, 2], m, ground frame."""
     fde_6s_m: float
 
 
 @dataclass(frozen=True)
 class HardCase:
-    """One pair, all that a picture of it shows."""
+    """One pair with all that its figure shows."""
 
     scene: str
     agent: str
@@ -39,21 +39,24 @@ class HardCase:
     """FDE at 6 s of the Kalman filter."""
     raster: Raster
     history: Floats
-    """[F, 2], m, oldest first; the last one is now."""
+    """[F, 2], m, oldest first, up to now."""
     truth: Floats
     """[T, 2], m."""
     others: Floats
-    """[M, 2], m: agents around it, now."""
+    """[M, 2], m, present positions of the other agents."""
     forecasts: Mapping[str, CaseForecast]
     """By ``name@version``."""
 
 
 def hardest_fde(fde_m: Floats, mismatch_m: Floats) -> dict[str, float]:
-    """Mean FDE on the hardest 1, 2 and 3 % of the pairs, and on all: ``fde_hardest_1_m`` … ``_all_m``.
+    """Return the mean FDE on the hardest 1, 2 and 3 % of the pairs, and on all.
 
     Args:
         fde_m: [N], m, at 6 s; NaN where there is no forecast.
-        mismatch_m: [N], m, the Kalman filter's; pairs where it is NaN have no rank and are left out.
+        mismatch_m: [N], m, FDE of the Kalman filter; pairs where it is NaN are left out.
+
+    Returns:
+        ``fde_hardest_1_m`` … ``fde_hardest_3_m`` and ``fde_hardest_all_m``.
     """
     ranked = np.isfinite(mismatch_m)
     fde_m, mismatch_m = fde_m[ranked], mismatch_m[ranked]
@@ -66,11 +69,11 @@ def hardest_fde(fde_m: Floats, mismatch_m: Floats) -> dict[str, float]:
 
 
 def shown_cases(scenes: Sequence[PlannedScene], mismatch_m: Floats) -> list[tuple[PlannedScene, int]]:
-    """The hardest pairs, the hardest first, one an agent: its scene and its number there.
+    """Return the hardest pairs, the hardest first, at most one per agent: scene and index in the scene.
 
     Args:
-        scenes: of all pairs.
-        mismatch_m: [N], m, of all pairs in order.
+        scenes: all scenes.
+        mismatch_m: [N], m, FDE of the Kalman filter for all pairs in order.
     """
     where = [(scene, number) for scene in scenes for number in range(len(scene.pairs))]
     shown: list[tuple[PlannedScene, int]] = []
@@ -89,13 +92,13 @@ def shown_cases(scenes: Sequence[PlannedScene], mismatch_m: Floats) -> list[tupl
 def hard_case(
     scene: PlannedScene, number: int, mismatch_m: float, mixtures: Mapping[str, TrajectoryMixture]
 ) -> HardCase:
-    """One pair with its forecasts.
+    """Return one pair with its forecasts.
 
     Args:
-        scene: that it is in.
-        number: of the pair in its scene.
+        scene: scene of the pair.
+        number: index of the pair in its scene.
         mismatch_m: FDE at 6 s of the Kalman filter.
-        mixtures: by ``name@version``, of this one pair.
+        mixtures: forecasts of this one pair, by ``name@version``.
     """
     record, pair = scene.record, scene.pairs[number]
     track = record.tracks[pair.track]
@@ -120,12 +123,12 @@ def hard_case(
 
 
 def _forecast(mixture: TrajectoryMixture, truth: Floats) -> CaseForecast:
-    likeliest = mixture.most_likely_trajectory()[0].numpy()
+    most_likely = mixture.most_likely_trajectory()[0].numpy()
     return CaseForecast(
         mixture.weights[0].double().numpy(),
         mixture.world_means[0].numpy(),
-        likeliest,
-        float(np.hypot(*(likeliest[-1] - truth[-1]))),
+        most_likely,
+        float(np.hypot(*(most_likely[-1] - truth[-1]))),
     )
 
 

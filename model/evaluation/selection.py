@@ -1,4 +1,4 @@
-"""What is evaluated: checkpoints of one protocol, the baselines, the physics oracle."""
+"""Selection of the models that are evaluated: checkpoints of one protocol, baselines, the physics oracle."""
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
@@ -13,35 +13,34 @@ from model.scenes.scene import AgentType
 
 
 class EvaluationError(Exception):
-    """There is nothing to evaluate as asked; the text says why."""
+    """The evaluation cannot run as requested; the text says why."""
 
 
 @dataclass(frozen=True)
 class Learned:
-    """A checkpoint."""
+    """A checkpoint with its forecaster."""
 
     config: AnyNetworkConfig
-    """Says what it looks at, and how."""
     forecaster: Forecaster
 
     @property
     def info(self) -> ModelInfo:
-        """What is known of it."""
+        """Description of the model."""
         return self.forecaster.info
 
 
 @dataclass(frozen=True)
-class Subjects:
-    """What is evaluated, in the order of the tables."""
+class Selection:
+    """The models of an evaluation, in the order of the tables."""
 
     baselines: tuple[Forecaster, ...]
     oracle: bool
-    """Of the four physics baselines."""
+    """Whether the physics oracle is among them."""
     learned: tuple[Learned, ...]
 
     @property
-    def rows(self) -> tuple[str, ...]:
-        """Keys of all (see ``key``)."""
+    def names(self) -> tuple[str, ...]:
+        """``name@version`` of every model, and the name of the oracle."""
         oracle = (ORACLE,) if self.oracle else ()
         return (
             *(one.info.full_name for one in self.baselines),
@@ -50,17 +49,17 @@ class Subjects:
         )
 
 
-def choose(folder: Path | None, protocol: Protocol, only: Collection[str] = ()) -> Subjects:
-    """Chooses what is evaluated.
+def select(folder: Path | None, protocol: Protocol, only: Collection[str] = ()) -> Selection:
+    """Select the models to evaluate.
 
     Args:
-        folder: of checkpoints (``load_checkpoints``); None: there is none.
-        protocol: checkpoints of another are left out.
-        only: names or ``name@version`` of those that are wanted; empty: all.
+        folder: folder of checkpoints (``load_checkpoints``); None: no checkpoints.
+        protocol: protocol of the inputs; checkpoints of the other one are left out.
+        only: names or ``name@version`` of the models to keep; empty: all.
 
     Raises:
-        CheckpointError: there is no such folder, or a checkpoint is damaged.
-        EvaluationError: a name is unknown, or a checkpoint is needed and there is none of that protocol.
+        CheckpointError: the folder does not exist, or a checkpoint is damaged.
+        EvaluationError: a name is unknown, or all models are wanted and no checkpoint fits the protocol.
     """
     checkpoints = [] if folder is None else list(load_checkpoints(folder))
     fitting = [one for one in checkpoints if _fits(one, protocol)]
@@ -74,7 +73,7 @@ def choose(folder: Path | None, protocol: Protocol, only: Collection[str] = ()) 
             f"{where}: there is no checkpoint of the {protocol.value} protocol that forecasts vehicles"
             + (f"; there are {others}" if others else "")
         )
-    return Subjects(
+    return Selection(
         tuple(one for one in candidates if _wanted(one.info, only)),
         not only or ORACLE in only,
         tuple(Learned(one.network, one.forecaster()) for one in fitting if _wanted(one.info, only)),
@@ -91,9 +90,9 @@ def _wanted(info: ModelInfo, only: Collection[str]) -> bool:
 
 def _check_names(infos: Sequence[ModelInfo], protocol: Protocol, only: Iterable[str]) -> None:
     keys = [info.full_name for info in infos]
-    twice = sorted({name for name in keys if keys.count(name) > 1})
-    if twice:
-        raise EvaluationError(f"there are two models {', '.join(twice)}")
+    duplicates = sorted({name for name in keys if keys.count(name) > 1})
+    if duplicates:
+        raise EvaluationError(f"there are two models {', '.join(duplicates)}")
     names = {info.name for info in infos} | {ORACLE}
     for name in only:
         if name not in names and name not in keys:
