@@ -144,7 +144,7 @@ class Phase(NamedTuple):
     share: float
     """Share of the duration of the whole run."""
     healthy: bool
-    """Whether tracking must recover in this phase."""
+    """True if tracking must recover in this phase."""
 
 
 PHASES = (
@@ -178,7 +178,7 @@ class PhaseResult:
 
     name: str
     healthy: bool
-    """Whether tracking had to recover in this phase."""
+    """True if tracking had to recover in this phase."""
     calls: Sequence[Call]
     """Calls sent in this phase."""
     errors: "Counter[str]"

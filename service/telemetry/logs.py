@@ -1,4 +1,4 @@
-"""Logs: structlog for our own lines and for those of the libraries, to stderr."""
+"""Logs to stderr: structlog for the service's own lines and for those of libraries."""
 
 import logging
 import sys
@@ -6,16 +6,16 @@ import sys
 import structlog
 from structlog.typing import Processor
 
-# No values of variables: among them there may be a password, or somebody's request
+# No values of local variables: they may hold a password or a request
 _FRAMES = structlog.tracebacks.ExceptionDictTransformer(show_locals=False)
 
 
 def configure(level: str, as_json: bool) -> None:
-    """Sets up logging for the whole process.
+    """Configure logging for the whole process.
 
     Args:
         level: "debug", "info", "warning" or "error".
-        as_json: one JSON object a line, else text for people.
+        as_json: True: one JSON object per line; False: text for a terminal.
     """
     shared: list[Processor] = [
         structlog.contextvars.merge_contextvars,
@@ -53,6 +53,6 @@ def configure(level: str, as_json: bool) -> None:
     root = logging.getLogger()
     root.handlers = [handler]
     root.setLevel(level.upper())
-    # Ours says when it listens and stops; the library's lines would only say it twice.
+    # The service logs its own start and stop; uvicorn's lines would repeat them
     logging.getLogger("uvicorn").setLevel(max(logging.WARNING, root.level))
     logging.getLogger("asyncio").setLevel(max(logging.INFO, root.level))

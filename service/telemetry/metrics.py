@@ -1,4 +1,4 @@
-"""Prometheus metrics. Every server object has its own registry, so that tests can run many."""
+"""Prometheus metrics. Each server object has its own registry, so that one process can run several."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,7 +22,7 @@ _AGENTS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
 
 
 class Metrics:
-    """All metrics of one server. Labels are names from fixed, small sets; never ids."""
+    """Metrics of one server. Label values come from small, fixed sets; they are never ids."""
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
@@ -37,33 +37,33 @@ class Metrics:
         )
         self.request_duration = Histogram(
             "forecast_request_duration_seconds",
-            "Calls from their arrival to their answer.",
+            "Duration of calls from arrival to response.",
             ["transport", "method"],
             buckets=_SECONDS,
             registry=self.registry,
         )
         self.queue = Histogram(
             "forecast_queue_seconds",
-            "Waiting for the model to be free.",
+            "Time that jobs wait in the queue until the model is free.",
             buckets=_SECONDS,
             registry=self.registry,
         )
         self.inference = Histogram(
             "forecast_inference_seconds",
-            "One batch inside the model.",
+            "Duration of one batch in the model.",
             ["model"],
             buckets=_SECONDS,
             registry=self.registry,
         )
         self.batch_agents = Histogram(
             "forecast_batch_agents",
-            "Agents in a batch, of all calls that rode in it.",
+            "Agents per batch, over all calls in it.",
             buckets=_AGENTS,
             registry=self.registry,
         )
         self.agents = Counter(
             "forecast_agents_total",
-            "Agents of answered calls, by the model that was asked for and what became of them.",
+            "Agents of answered calls, by requested model and forecast status.",
             ["model", "status"],
             registry=self.registry,
         )
@@ -75,39 +75,39 @@ class Metrics:
         )
         self.nonfinite = Counter(
             "forecast_nonfinite_total",
-            "Forecasts thrown away because the model gave a number that is not finite.",
+            "Forecasts discarded because the model returned a non-finite number.",
             ["model"],
             registry=self.registry,
         )
         self.queue_agents = Gauge(
             "forecast_queue_agents",
-            "Agents accepted that are not in the model yet.",
+            "Accepted agents that wait in the queue.",
             registry=self.registry,
         )
         self.model_info = Gauge(
             "forecast_model_info",
-            "1 for each model that is loaded.",
+            "1 for each loaded model.",
             ["name", "version", "protocol", "default"],
             registry=self.registry,
         )
         self.benchmark = Gauge(
             "forecast_benchmark_displacement_error_meters",
-            "What the benchmark measured of forecast_displacement_error_meters, on average.",
+            "Mean of forecast_displacement_error_meters in the benchmark.",
             ["model", "horizon"],
             registry=self.registry,
         )
 
     def set_models(self, infos: list[ModelInfo], default: ModelInfo) -> None:
-        """Says which models are loaded, and what the benchmark measured of them.
+        """Set the metrics of the loaded models and their benchmark errors.
 
         Args:
-            infos: all, of one name the oldest first.
-            default: one of them.
+            infos: all models; the versions of one name ascend.
+            default: the default model.
         """
         for info in infos:
             is_default = "true" if info == default else "false"
             self.model_info.labels(info.name, info.version, info.protocol.value, is_default).set(1)
-            # A series that began with its first event would hide it: nothing has increased since
+            # Start at 0: rate() and increase() would miss the first event of a series that begins with it
             self.nonfinite.labels(info.name)
         for info in _by_name(infos, default).values():
             for seconds in range(1, int(info.horizon) + 1):
@@ -117,12 +117,12 @@ class Metrics:
 
     @contextmanager
     def call(self, transport: str, method: str, timed: bool = True) -> Iterator["Call"]:
-        """Counts one call and times it; its code is what the caller of this puts into it.
+        """Count and time one call; the caller sets its code.
 
         Args:
             transport: "grpc" or "rest".
-            method: of the contract.
-            timed: False for one that lasts as long as the client likes.
+            method: method of the contract.
+            timed: False for streams, which last as long as the client wants.
         """
         call = Call()
         started = perf_counter()
@@ -134,20 +134,22 @@ class Metrics:
                 self.request_duration.labels(transport, method).observe(perf_counter() - started)
 
     def render(self) -> bytes:
-        """The text that Prometheus reads."""
+        """Return the metrics in the Prometheus text format; this changes nothing."""
         return generate_latest(self.registry)
 
 
 def _by_name(infos: list[ModelInfo], default: ModelInfo) -> dict[str, ModelInfo]:
-    """Of each name the version that is meant where none is given: the default, or the newest causal one, or
-    the newest."""
+    """Return the version of each name that a request without a version gets.
+
+    It is the default model's, else the newest causal version, else the newest version.
+    """
     causal_last = sorted(infos, key=lambda info: info.protocol is Protocol.CAUSAL)
     return {info.name: info for info in [*causal_last, default]}
 
 
 class Call:
-    """How a call ended."""
+    """Result of a call."""
 
     def __init__(self) -> None:
         self.code = "CANCELLED"
-        """Canonical status code; stays as it is when the client goes away first."""
+        """Canonical status code; it stays CANCELLED if the client disconnects first."""

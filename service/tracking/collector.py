@@ -27,14 +27,14 @@ class StoreMetrics:
     def __init__(self, registry: CollectorRegistry) -> None:
         self._seconds = Histogram(
             "forecast_track_store_seconds",
-            "Calls to the track memory, each to its own end.",
+            "Duration of calls to the track memory, until they end.",
             ["op"],
             buckets=_STORE_SECONDS,
             registry=registry,
         )
         self._errors = Counter(
             "forecast_track_store_errors_total",
-            "Calls to the track memory that got no answer in time, by what happened.",
+            "Calls to the track memory that failed or were late, by reason.",
             ["op", "reason"],
             registry=registry,
         )
@@ -66,17 +66,17 @@ class ConsistencyCollector(Collector):
         """Return the metrics by model name; the versions of a model are added up."""
         dispersion = HistogramMetricFamily(
             "forecast_dispersion_meters",
-            "Standard deviation of the distances to their barycentre of all ages' forecasts for one instant.",
+            "Standard deviation of the distances of all ages' forecasts for an instant to their barycentre.",
             labels=["model"],
         )
         convergence = HistogramMetricFamily(
             "forecast_convergence_seconds",
-            "Since when all forecasts for an instant had been within tau meters of what was observed.",
+            "Seconds for which all forecasts for an instant had been within tau meters of the observation.",
             labels=["model", "tau"],
         )
         errors = HistogramMetricFamily(
             "forecast_displacement_error_meters",
-            "Distance of the most likely forecast made horizon seconds ahead to what was observed.",
+            "Distance of the most likely forecast made horizon seconds ahead to the observed position.",
             labels=["model", "horizon"],
         )
         by_name: dict[str, list[ModelAggregate]] = {}

@@ -36,7 +36,7 @@ class TrackingResult:
 
     @property
     def answered(self) -> bool:
-        """Whether the memory answered in time."""
+        """True if the memory answered in time."""
         return self.status != pb.TRACKING_STATUS_UNAVAILABLE
 
 

@@ -1,4 +1,4 @@
-"""Forecasts go on while Redis is killed, full, slow and hanging, and tracking comes back."""
+"""Forecasts continue while Redis is killed, full, slow and hanging, and tracking recovers."""
 
 import shutil
 from collections import Counter

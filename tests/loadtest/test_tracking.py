@@ -1,4 +1,4 @@
-"""The measurement of what tracking costs, with few calls: that it measures, not what."""
+"""Measurement of the cost of tracking, with few calls; the values are not checked."""
 
 import shutil
 from collections.abc import Iterator

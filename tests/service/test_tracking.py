@@ -1,4 +1,4 @@
-"""The track memory through a live server: what it says is what the metrics say of the same forecasts."""
+"""Track memory through a live server, against the offline metrics of the same forecasts."""
 
 import subprocess
 from collections.abc import AsyncIterator, Iterator
@@ -37,7 +37,7 @@ from tests.service.tracks import (
 
 MODEL = "kalman"
 PATIENT = {"store_budget_ms": 5000.0, "store_timeout_ms": 5000.0}
-"""Whatever else this machine has to do."""
+"""Settings with budgets that a busy machine does not exceed."""
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +96,7 @@ async def test_live_is_as_offline_on_real_tracks(shared: Path, server: Server, s
 
 
 def real_scene(labels: Path, step: float) -> Tracks:
-    """The 14 frames of a scene with most vehicles that are there all the time, and these."""
+    """Return the 14 consecutive frames of a scene with the most vehicles present in all of them."""
     rows = real_tracks(labels)
     frames = 14
 
@@ -215,7 +215,7 @@ async def test_blind_forecasts_are_not_remembered() -> None:
 
 @dataclass(frozen=True)
 class Served:
-    """A server in a process of its own."""
+    """Server in a process of its own."""
 
     process: "subprocess.Popen[str]"
     client: AsyncClient
@@ -223,7 +223,7 @@ class Served:
 
 @asynccontextmanager
 async def served(store: str) -> AsyncIterator[Served]:
-    """A server with the bundled models."""
+    """Run a server with the bundled models."""
     with process("--log-json", "--store", store, "--default-model", MODEL, **PATIENT) as started:
         _, address = ready(started)
         async with AsyncClient(address, timeout=30.0) as client:
@@ -231,7 +231,7 @@ async def served(store: str) -> AsyncIterator[Served]:
 
 
 async def test_two_servers_on_one_redis_one_of_them_killed(redis_url: str) -> None:
-    """As by one server: scenes in turn, the one that is killed replaced midway."""
+    """Two servers take the calls of each scene in turn; one is killed and replaced midway."""
     scenes = [made_up(scene_name()) for _ in range(3)]
     async with AsyncExitStack() as stack:
         staying = await stack.enter_async_context(served(redis_url))
@@ -259,7 +259,7 @@ async def test_two_servers_on_one_redis_one_of_them_killed(redis_url: str) -> No
 
 
 async def test_forecasts_go_on_without_the_memory() -> None:
-    """Redis is not there: each answer says so, and calls about the memory say what is the matter."""
+    """Redis is unreachable: each response says so, and consistency calls give the reason."""
     tracks = made_up(scene_name(), agents=2)
     away = f"redis://127.0.0.1:{free_port()}"
     async with (

@@ -1,4 +1,4 @@
-"""Tracks through a live server, and what the metrics say of the same forecasts without it."""
+"""Tracks replayed through a live server, and the offline metrics of the same forecasts."""
 
 import asyncio
 import random
@@ -24,7 +24,7 @@ from model.metrics.consistency import (
 
 @dataclass(frozen=True)
 class Track:
-    """Where an agent was at each of some frames, in a row."""
+    """Positions of an agent in consecutive frames."""
 
     first: int
     """Number of the first frame."""
@@ -38,24 +38,24 @@ class Tracks:
 
     name: str
     start: float
-    """s, of frame 0."""
+    """Time of frame 0, s."""
     step: float
-    """s between frames; divides 0.5 s."""
+    """Seconds between frames; divides 0.5 s."""
     agents: Mapping[str, Track]
     history_s: float = 1.0
-    """s of history in a request."""
+    """Seconds of history in a request."""
 
     def time(self, frame: int) -> float:
         """s."""
         return self.start + self.step * frame
 
     def frames(self) -> list[int]:
-        """All at which anybody is there."""
+        """Return the frames with at least one agent."""
         ends = [(track.first, track.first + len(track.position)) for track in self.agents.values()]
         return list(range(min(first for first, _ in ends), max(end for _, end in ends)))
 
     def request(self, frame: int, model: str, newest_only: bool = False) -> pb.PredictRequest:
-        """All agents at a frame, with their histories."""
+        """Return the request of a frame: its agents with their histories."""
         request = pb.PredictRequest(scene_id=self.name, time=self.time(frame), model=model)
         if newest_only:
             request.options.history = pb.HISTORY_SOURCE_MEMORY
@@ -72,7 +72,7 @@ class Tracks:
 
 
 def at_rate(track: Track, parts: int) -> Track:
-    """A track with so many frames for each, interpolated."""
+    """Return a track with several frames per frame, interpolated."""
     count = len(track.position)
     at = np.linspace(0, count - 1, (count - 1) * parts + 1)
     position = np.stack([np.interp(at, np.arange(count), track.position[:, k]) for k in (0, 1)], axis=1)
@@ -80,7 +80,7 @@ def at_rate(track: Track, parts: int) -> Track:
 
 
 def made_up(name: str, step: float = 0.5, seconds: float = 12.0, agents: int = 4) -> Tracks:
-    """Agents that swerve and brake; they come and go one after the other."""
+    """Return tracks of agents that swerve and brake, each appearing a second after the one before."""
     frames = round(seconds / step)
     tracks = {}
     for number in range(agents):
@@ -92,25 +92,25 @@ def made_up(name: str, step: float = 0.5, seconds: float = 12.0, agents: int = 4
 
 
 def late(frames: Sequence[int], step: float, seconds: float) -> list[int]:
-    """Frames in the order in which they come where each is up to some seconds late."""
+    """Return frames in the order of arrival if each is up to some seconds late."""
     rng = random.Random(len(frames))
     return sorted(frames, key=lambda frame: frame * step + rng.uniform(0, seconds))
 
 
 @dataclass
 class Replayed:
-    """What came of a replay."""
+    """Results of a replay."""
 
     paths: dict[tuple[str, int], Floats] = field(default_factory=dict)
     """Likeliest path [T, 2], m, by agent and frame."""
     settled: dict[tuple[str, int], consistency_pb.InstantConsistency] = field(default_factory=dict)
-    """By agent and frame."""
+    """Settled instants by agent and frame."""
     answers: dict[int, pb.PredictResponse] = field(default_factory=dict)
-    """By frame."""
+    """Responses by frame."""
 
 
 class Watch:
-    """Collects what is settled in a scene, from when it is entered on."""
+    """Context manager that collects the settled instants of a scene."""
 
     def __init__(self, client: AsyncClient, tracks: Tracks, replayed: Replayed) -> None:
         self._client, self._tracks, self._replayed = client, tracks, replayed
@@ -126,7 +126,7 @@ class Watch:
         await self._task
 
     async def until(self, instants: int, seconds: float = 30.0) -> None:
-        """Returns when so many were settled."""
+        """Wait until that many instants have settled."""
         async with asyncio.timeout(seconds):
             while len(self._replayed.settled) < instants:
                 await self._changed.wait()
@@ -151,7 +151,7 @@ async def replay(
     newest_only: bool = False,
     into: Replayed | None = None,
 ) -> Replayed:
-    """Sends frames in an order, to the clients in turn."""
+    """Send frames in an order, to the clients in turn."""
     replayed = into or Replayed()
     for turn, frame in enumerate(order):
         request = tracks.request(frame, model, newest_only)
@@ -164,7 +164,7 @@ async def replay(
 
 
 def offline(tracks: Tracks, paths: Mapping[tuple[str, int], Floats]) -> dict[tuple[str, int], list[float]]:
-    """What the metrics say of each complete set, by agent and frame: dispersion, C(τ), errors by age.
+    """Return the metrics of each complete set, by agent and frame: dispersion, C(τ), errors by age.
 
     At more than 2 Hz the frames of a track are several rows of frames 0.5 s apart.
     """
@@ -196,7 +196,7 @@ def offline(tracks: Tracks, paths: Mapping[tuple[str, int], Floats]) -> dict[tup
 
 
 def live(instant: consistency_pb.InstantConsistency) -> list[float]:
-    """The same of what the server said."""
+    """Return the same metrics of a server's message."""
     apart = instant.dispersion
     return [
         apart.standard_deviation,
@@ -208,7 +208,7 @@ def live(instant: consistency_pb.InstantConsistency) -> list[float]:
 
 
 async def check(tracks: Tracks, replayed: Replayed, watch: Watch) -> int:
-    """Whether what was said live is what the metrics say, to 1e-6; how many sets there were."""
+    """Assert that the live metrics equal the offline ones to 1e-6, and return the number of sets."""
     expected = offline(tracks, replayed.paths)
     await watch.until(len(expected))
     assert replayed.settled.keys() == expected.keys()

@@ -87,7 +87,7 @@ class ExchangeResult:
     instants: Instants
     """Newest observation of each agent with a model, and all instants that the call settled."""
     watched: bool
-    """Whether the scene has a watcher, on any server."""
+    """True if the scene has a watcher, on any server."""
 
 
 @dataclass(frozen=True)

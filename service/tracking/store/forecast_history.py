@@ -29,9 +29,9 @@ class ForecastSet(NamedTuple):
     blocks: list[bytes]
     """[A], the steps before, at and after the age."""
     complete: bool
-    """Whether there is a forecast of each age."""
+    """True if there is a forecast of each age."""
     exact: bool
-    """Whether all forecasts were made exactly on their lags."""
+    """True if all forecasts were made exactly on their lags."""
 
 
 class ForecastHistory:

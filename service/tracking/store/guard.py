@@ -51,7 +51,7 @@ class CircuitBreaker:
 
     @property
     def ready(self) -> bool:
-        """Whether a call may be made now."""
+        """True if a call may be made now."""
         return self._open_until is None or (not self._probing and self._clock() >= self._open_until)
 
     def begin(self) -> bool:
@@ -88,7 +88,7 @@ class _Attempt:
 
     op: str
     probe: bool
-    """Whether the call is the probe of the circuit breaker."""
+    """True if the call is the probe of the circuit breaker."""
     deadline: float
     """On the event loop's clock, s."""
     recorded: bool = False

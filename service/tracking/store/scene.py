@@ -29,7 +29,7 @@ class ApplyResult:
     instants: list[Instant] = field(default_factory=list)
     """Instants to report."""
     restarted: bool = False
-    """Whether the scene was cleared because its newest call was too far ahead of this one."""
+    """True if the scene was cleared because its newest call was too far ahead of this one."""
 
 
 class SceneMemory:

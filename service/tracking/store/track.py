@@ -44,7 +44,7 @@ class Track:
         self._agent_type = agent_type
         self._observations = ObservationBuffer()
         self._forecasts: dict[str, ForecastHistory] = {}
-        """By model."""
+        """Forecasts by model."""
 
     @property
     def newest(self) -> float:

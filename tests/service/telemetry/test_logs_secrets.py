@@ -1,4 +1,4 @@
-"""What a log must not hold."""
+"""Secrets that a log must not contain."""
 
 import logging
 from collections.abc import Iterator

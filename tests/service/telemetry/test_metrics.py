@@ -1,4 +1,4 @@
-"""What Prometheus reads."""
+"""Exported metrics."""
 
 import httpx
 import pytest

@@ -90,7 +90,7 @@ async def test_a_scrape_reads_and_changes_nothing() -> None:
 
 
 def aggregates_state(tracker: Tracker) -> bytes:
-    """All that the aggregates consist of."""
+    """Return the whole state of the aggregates."""
     return pickle.dumps(tracker.aggregates)
 
 
@@ -106,5 +106,5 @@ async def test_two_scrapes_of_a_server_are_equal() -> None:
 
 
 def own_lines(text: bytes) -> list[str]:
-    """Lines of the service's own metrics; those of the process change by themselves."""
+    """Return the lines of the service's own metrics; those of the process change by themselves."""
     return [line for line in text.decode().splitlines() if line.startswith("forecast_")]

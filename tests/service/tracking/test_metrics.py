@@ -1,4 +1,4 @@
-"""InstantMetrics of sets against the metrics of ``model.metrics``."""
+"""Metrics of instants against those of ``model.metrics``."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from service.tracking.store.records import AGES, COMPLETE, INSTANT, MODES, NEWLY
 
 
 def instants(count: int, seed: int = 0) -> np.ndarray:
-    """Made-up ones on their lags, far from the origin; flags as they come."""
+    """Return random instants with forecasts on their lags, far from the origin, settled by this call."""
     rng = np.random.default_rng(seed)
     made = np.zeros(count, dtype=INSTANT)
     made["time"] = 1.6e9 + rng.uniform(0, 100, count)

@@ -56,7 +56,7 @@ class _Scene:
         self.agents = 0
         """Number of agents after the last use."""
         self.lost = False
-        """Whether the known log is gone and no call has reported it yet."""
+        """True if the known log is gone and no call has reported it yet."""
         self.unreported: list[Instant] = []
         """Instants from this server's own entries whose replies were lost, until a call reports them."""
         self._times: deque[tuple[int, float]] = deque()

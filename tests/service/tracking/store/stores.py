@@ -27,7 +27,7 @@ def require_redis() -> None:
 async def opened(
     url: str, expiry: float = EXPIRY, max_agents: int = MAX_AGENTS, timeout_s: float = 5.0
 ) -> AsyncIterator[RedisStore]:
-    """A store on Redis."""
+    """Open a store on Redis."""
     address = parse_address(url)
     store = RedisStore(
         connect(address, timeout_s=timeout_s, connections=8),
@@ -42,10 +42,10 @@ async def opened(
 
 
 def memory() -> TrackStore:
-    """The store in this process."""
+    """Return an in-process store."""
     return MemoryStore(EXPIRY, MAX_AGENTS)
 
 
 def scene_name() -> str:
-    """A scene that no other test has."""
+    """Return a scene id that no other test uses."""
     return f"scene {uuid.uuid4().hex}"

@@ -1,4 +1,4 @@
-"""What every track memory does: in this process, in one Redis, in a cluster of six nodes."""
+"""Behaviour shared by all stores: in-process, a single Redis, and a cluster of six nodes."""
 
 import asyncio
 from collections.abc import AsyncIterator, Sequence
@@ -26,7 +26,7 @@ async def replay(store: TrackStore, scene: str, moments: Sequence[float]) -> lis
 
 
 def newly(answers: Sequence[ExchangeResult]) -> list[tuple[str, str, float]]:
-    """What was settled, in order."""
+    """Return the settled instants in order."""
     return [
         (agent_id, model, float(row["time"]))
         for answer in answers

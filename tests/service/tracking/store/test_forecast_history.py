@@ -10,12 +10,12 @@ from tests.service.tracking.store.track_updates import START, forecast, times
 
 
 def path(steps: int = AGES, y: float = 0.0) -> bytes:
-    """A forecast whose x at each step is the number of the step, m."""
+    """Return a forecast whose x at each step is the number of the step, m."""
     return forecast(np.stack([np.arange(steps + 1.0), np.full(steps + 1, y)], axis=1))
 
 
 def filled(offset: float = 0.0, steps: int = AGES) -> ForecastHistory:
-    """Forecasts at the twelve lags of the thirteenth time, each made some seconds later."""
+    """Return forecasts at the twelve lags of the thirteenth time, each made some seconds later."""
     history = ForecastHistory()
     for time in times(AGES):
         assert history.insert(time + offset, path(steps), steps)

@@ -17,13 +17,13 @@ from service.tracking.store.guard import CircuitBreaker, Guard
 from service.tracking.store.redis.connection import connect
 
 LONG = 30.0
-"""s; a budget that is never used up."""
+"""Budget that is never exceeded, s."""
 SHORT = 0.001
-"""s; one that is."""
+"""Budget that is always exceeded, s."""
 
 
 class Watched:
-    """A guard, and what it counts."""
+    """Guard and its metrics."""
 
     def __init__(self, **options: Any) -> None:
         self.now = 0.0
@@ -37,19 +37,19 @@ class Watched:
         )
 
     async def fail(self, error: Exception | None = None) -> None:
-        """One call that fails."""
+        """Make one call that fails."""
         with pytest.raises(StoreError):
             await self.guard.run("read", raising(error or redis_errors.ConnectionError()), LONG)
 
     async def open_circuit(self) -> None:
-        """As many as it takes."""
+        """Make enough failing calls."""
         for _ in range(3):
             await self.fail()
         self.failures.clear()
 
 
 class Held:
-    """A call that ends when it is told to."""
+    """Call that ends when the test releases it."""
 
     def __init__(self, error: Exception | None = None) -> None:
         self.begun = asyncio.Event()
@@ -81,7 +81,7 @@ async def answer() -> str:
 
 
 async def until_idle(guard: Guard) -> None:
-    """Returns when no call is under way any more."""
+    """Wait until no call is in progress."""
     async with asyncio.timeout(10):
         while guard.outstanding:  # noqa: ASYNC110 - no event tells
             await asyncio.sleep(0)
@@ -347,7 +347,7 @@ async def test_many_calls_at_once_against_a_network_that_hangs(redis_proxy: Faul
 
 
 class Clock:
-    """Shows what it is told."""
+    """Clock that a test sets."""
 
     def __init__(self) -> None:
         self.now = 100.0
@@ -367,7 +367,7 @@ def circuit(clock: Clock) -> CircuitBreaker:
 
 
 def call(circuit: CircuitBreaker, success: bool) -> None:
-    """A call that ends before anything else happens."""
+    """Make a call that ends at once."""
     assert circuit.ready
     circuit.end(circuit.begin(), success)
 

@@ -1,4 +1,4 @@
-"""The codec of a log's entries."""
+"""Packing and unpacking of log entries."""
 
 import msgpack
 import pytest

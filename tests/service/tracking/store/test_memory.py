@@ -6,7 +6,7 @@ from tests.service.tracking.store.track_updates import START, track_update
 
 
 class Clock:
-    """A clock that a test sets."""
+    """Clock that a test sets."""
 
     def __init__(self) -> None:
         self.now = 0.0
@@ -16,7 +16,7 @@ class Clock:
 
 
 async def call(store: MemoryStore, scene: str, agents: int = 1) -> SceneStatus:
-    """One call of a scene, with agents of its own."""
+    """Make one call of a scene, with agents of its own."""
     updates = [track_update(START, f"{number}") for number in range(agents)]
     return (await store.exchange(scene, START, updates)).scene_status
 

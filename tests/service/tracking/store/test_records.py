@@ -1,4 +1,4 @@
-"""What is remembered, in bytes."""
+"""Binary records: packing and unpacking."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ from service.tracking.store.records import (
 
 
 def observations(counts: list[int]) -> Observations:
-    """Made-up ones; some numbers are not given."""
+    """Return random observations, some with missing values."""
     rng = np.random.default_rng(sum(counts))
     shape = len(counts), max(counts)
     time = np.sort(rng.uniform(0, 100, shape), axis=1)

@@ -1,4 +1,4 @@
-"""The state machine: which sets settle, when, and what is forgotten."""
+"""State machine of a scene: which sets settle and when, and what is dropped."""
 
 import random
 
@@ -27,7 +27,7 @@ def replay(scene: SceneMemory, moments: list[float], **options: object) -> list[
 
 
 def settled(outcomes: list[ApplyResult]) -> dict[tuple[str, str, float], np.void]:
-    """What was settled, by agent, model and time; fails where something was settled twice."""
+    """Return the settled instants by agent, model and time; fail if one settles twice."""
     found: dict[tuple[str, str, float], np.void] = {}
     for outcome in outcomes:
         told = join_instants(outcome.instants)
@@ -160,7 +160,7 @@ def test_every_model_has_a_forecast_history_of_its_own() -> None:
 
 
 def test_an_observation_is_the_truth_for_every_model() -> None:
-    """As where an agent falls back to another model for one frame."""
+    """This happens when an agent falls back to another model for one frame."""
     scene = SceneMemory()
     moments = list(times(13))
     replay(scene, moments[:12])

@@ -1,4 +1,4 @@
-"""Updates to feed a memory with: an agent on a straight line, and forecasts that miss by a known offset."""
+"""Updates of an agent on a straight line, with forecasts that miss by a known offset."""
 
 from collections.abc import Sequence
 
@@ -14,21 +14,21 @@ START = 1.6e9
 
 
 def observation(time: float, position: tuple[float, float]) -> bytes:
-    """One observation of nothing but a position."""
+    """Return an observation with a position only."""
     values = np.full(OBSERVATION_FIELDS, np.nan)
     values[:3] = time, *position
     return values.tobytes()
 
 
 def forecast(path: Floats) -> bytes:
-    """A forecast of one mode: [T + 1, 2], m, from now on."""
+    """Return a forecast of one mode from its path, [T + 1, 2], m."""
     blocks = np.full(FORECAST_BLOCKS, np.nan, dtype=BLOCK)
     blocks["point"][: len(path)] = path
     return blocks.tobytes()
 
 
 def where(time: float, speed: float = 10.0, off: float = 0.0) -> tuple[float, float]:
-    """Where the agent is at a time, m."""
+    """Return the position of the agent at a time, m."""
     return speed * (time - START), off
 
 
@@ -43,7 +43,7 @@ def track_update(
     miss: float = 0.0,
     steps: int = 12,
 ) -> TrackUpdate:
-    """An agent seen and forecast at a time.
+    """Return an update: an observation and a forecast of one agent.
 
     Args:
         time: s.
@@ -63,5 +63,5 @@ def track_update(
 
 
 def times(count: int, step: float = 0.5, first: float = START) -> Sequence[float]:
-    """So many times, s."""
+    """Return evenly spaced times, s."""
     return [first + step * number for number in range(count)]

@@ -1,4 +1,4 @@
-"""Clients of real servers: what they send, how they fail, and that no reply goes to somebody else."""
+"""Clients of real servers: commands, failures, and that no call gets the reply of another one."""
 
 import asyncio
 import random
@@ -29,7 +29,7 @@ ECHO = "return ARGV[1]"
 async def connected(
     url: str | RedisAddress, timeout_s: float = 2.0, connections: int = 4
 ) -> AsyncIterator[Any]:
-    """A client, closed at the end."""
+    """Open a client."""
     address = parse_address(url) if isinstance(url, str) else url
     client = connect(address, timeout_s=timeout_s, connections=connections)
     try:
@@ -39,14 +39,14 @@ async def connected(
 
 
 async def echo(client: Any, number: int) -> None:
-    """A call whose reply nobody else may get; keys lie all over a cluster."""
+    """Make a call whose reply no other call may get; its key can be in any slot."""
     value = b"%d" % number
     assert await client.eval(ECHO, 1, f"key {number}", value) == value
 
 
 @pytest.fixture(params=LAYOUTS)
 def url(request: pytest.FixtureRequest) -> str:
-    """Of each layout."""
+    """Return a URL of each layout."""
     servers: Process | Cluster | Sentinels = request.getfixturevalue(request.param)
     return servers.url
 
@@ -55,7 +55,7 @@ def url(request: pytest.FixtureRequest) -> str:
 async def behind_a_network(
     request: pytest.FixtureRequest, layout: str, timeout_s: float, connections: int = 4
 ) -> AsyncIterator[tuple[Any, list[FaultProxy]]]:
-    """A client that reaches what keeps its data over proxies; and these."""
+    """Open a client whose connections to the data go through proxies; yield it and the proxies."""
     servers: Process | Cluster | Sentinels = request.getfixturevalue(layout)
     with ExitStack() as stack:
         if isinstance(servers, Cluster):
@@ -242,7 +242,7 @@ async def test_no_call_that_timed_out_leaves_its_reply_to_another(
 
 
 async def recovered(client: Any) -> None:
-    """Returns when calls are answered again, wherever their keys lie, several in a row."""
+    """Wait until several calls in a row are answered, whatever the slots of their keys."""
     async with asyncio.timeout(20):
         good = 0
         while good < 20:
@@ -287,7 +287,7 @@ async def test_a_demoted_master_is_left() -> None:
 
 
 async def written(client: Any) -> None:
-    """Returns when a value was written."""
+    """Wait until a value could be written."""
     async with asyncio.timeout(20):
         while True:
             with suppress(redis_errors.RedisError, redis_errors.RedisClusterException):
@@ -391,7 +391,7 @@ async def test_redirections_are_followed(redis_cluster: Cluster) -> None:
 
 @pytest.fixture
 def certificates(tmp_path: Path) -> Path:
-    """Folder of a certificate for this machine, its own authority."""
+    """Create a self-signed certificate for this machine and return its folder."""
     program = shutil.which("openssl")
     if program is None:
         pytest.skip("openssl is not installed")

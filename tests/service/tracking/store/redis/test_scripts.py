@@ -24,7 +24,7 @@ def test_no_id_ends_the_part_in_braces_early(scene_id: str) -> None:
 
 
 class FakeClient:
-    """Knows no script, or fails."""
+    """Client that knows no script, or fails."""
 
     def __init__(self, error: Exception) -> None:
         self.error = error

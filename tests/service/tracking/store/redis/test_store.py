@@ -1,4 +1,4 @@
-"""What is of Redis alone: several servers on one log, and whatever happens to it."""
+"""Redis store: several servers on one log, and faults of the log."""
 
 import asyncio
 import random
@@ -26,13 +26,13 @@ async def store(redis_server: Process) -> AsyncIterator[RedisStore]:
 
 @pytest.fixture
 async def other(redis_server: Process) -> AsyncIterator[RedisStore]:
-    """Another server's."""
+    """Open the store of another server."""
     async with opened(redis_server.url) as one:
         yield one
 
 
 def rows(answers: Sequence[ExchangeResult]) -> list[bytes]:
-    """What was settled, in order of time and agent."""
+    """Return the settled instants, by time and agent."""
     found = []
     for answer in answers:
         told = answer.instants
@@ -45,7 +45,7 @@ def rows(answers: Sequence[ExchangeResult]) -> list[bytes]:
 
 
 async def replay(stores: Sequence[TrackStore], scene: str, moments: Sequence[float]) -> list[ExchangeResult]:
-    """Calls to the stores in turn."""
+    """Make calls to the stores in turn."""
     return [
         await stores[number % len(stores)].exchange(
             scene, t, [track_update(t), track_update(t, "b", off=9.0, miss=1.0)]
@@ -55,7 +55,7 @@ async def replay(stores: Sequence[TrackStore], scene: str, moments: Sequence[flo
 
 
 def number(server: Process, *words: str) -> int:
-    """The answer to a command, which is a number."""
+    """Run a command and return its reply, a number."""
     answer = server.command(*words)
     assert isinstance(answer, int)
     return answer
@@ -64,7 +64,7 @@ def number(server: Process, *words: str) -> int:
 async def lose_the_answer(
     store: RedisStore, scene: str, moments: Sequence[float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Calls that Redis gets, but of which no answer comes."""
+    """Make calls that reach Redis but whose replies are lost."""
     run = store._append.run
 
     async def lose(*arguments: object) -> object:
@@ -181,7 +181,7 @@ async def test_a_reset_by_another_server_is_noticed(store: RedisStore, other: Re
 
 
 async def test_a_log_that_lost_its_end(redis_server: Process, store: RedisStore, other: RedisStore) -> None:
-    """As when a replica takes over that had not got the last entries."""
+    """This happens when a replica takes over that has not received the last entries."""
     scene = scene_name()
     log = SceneKeys(scene).log
     await replay([store], scene, times(12))
@@ -363,7 +363,7 @@ async def test_a_cancelled_call_leaves_no_trouble(store: RedisStore) -> None:
 
 
 class FakeWatchClient:
-    """A client whose reads fail."""
+    """Client whose reads fail."""
 
     def __init__(self, error: Exception) -> None:
         self.error = error
@@ -382,7 +382,7 @@ class FakeWatchClient:
 
 
 async def next_of_a_watch(error: Exception) -> object:
-    """What a watch raises after its beginning, if reading raises this."""
+    """Return the second item of a watch whose reads raise an error."""
     client = FakeWatchClient(error)
     source = RedisStore(client, client, 30.0, 100).watch("scene")
     assert await anext(source) == ((), 0)
