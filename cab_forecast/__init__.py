@@ -1,15 +1,14 @@
-"""The public client of a cab-forecast server.
+"""Public client of a cab-forecast server.
 
-Names are imported on first use, so that a planner that only calls ``predict`` loads protobuf and one
-transport, and neither numpy nor Pillow.
+Names are imported on first use, so that a program that only calls ``predict`` loads protobuf and one
+transport, but neither numpy nor Pillow.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from cab_forecast.async_client import AsyncClient
-    from cab_forecast.client import Client
+    from cab_forecast.client import AsyncClient, Client
     from cab_forecast.demo import demo_request
     from cab_forecast.errors import (
         BadRequest,
@@ -59,7 +58,7 @@ __all__ = [
 ]
 
 _MODULES = {
-    "AsyncClient": "async_client",
+    "AsyncClient": "client",
     "AsyncStream": "streams",
     "Client": "client",
     "demo_request": "demo",

@@ -1,4 +1,4 @@
-"""The blocking client, over gRPC or REST."""
+"""Clients over gRPC or REST: a blocking one, and one for asyncio."""
 
 from os import PathLike
 from types import TracebackType
@@ -17,11 +17,9 @@ from cab.forecast.v1.consistency_service_pb2 import (
     WatchSceneRequest,
     WatchSceneResponse,
 )
-from cab.forecast.v1.model_service_pb2 import ListModelsRequest, Model
+from cab.forecast.v1.model_service_pb2 import GetModelRequest, ListModelsRequest, Model
 from cab.forecast.v1.prediction_service_pb2 import PredictRequest, PredictResponse
-from cab_forecast.connecting import DEFAULT_RETRIES, DEFAULT_TIMEOUT, ClientSettings, open_transport
-from cab_forecast.endpoints import DEFAULT_ENDPOINT
-from cab_forecast.methods import (
+from cab.forecast.v1.routes import (
     GET_AGENT_CONSISTENCY,
     GET_MODEL,
     GET_SCENE_CONSISTENCY,
@@ -30,21 +28,29 @@ from cab_forecast.methods import (
     PREDICT,
     RESET_SCENE,
     WATCH_SCENE,
-    Method,
     Request,
     Response,
-    get_model_request,
+    Route,
 )
-from cab_forecast.streams import Stream
-from cab_forecast.timing import RETRY, WAIT, Budget, stop
-from cab_forecast.transport import Encoding
+from cab_forecast.connection import (
+    DEFAULT_RETRIES,
+    DEFAULT_TIMEOUT,
+    AsyncTransport,
+    ClientSettings,
+    Encoding,
+    open_async_transport,
+    open_transport,
+)
+from cab_forecast.endpoints import DEFAULT_ENDPOINT
+from cab_forecast.streams import AsyncStream, OpenStream, Stream
+from cab_forecast.timing import RETRY, WAIT, Budget, stop_condition
 
 
 class Client:
     """A blocking client, usable from several threads.
 
-    Overload, a draining server, a track memory that does not answer and lost connections are retried, other
-    errors are not. Asking twice does no harm: of one request the server remembers one thing.
+    Overload, a draining server, an unavailable track memory and lost connections are retried; other errors
+    are not. Retries are safe: the server records a repeated request only once.
     """
 
     def __init__(
@@ -57,129 +63,132 @@ class Client:
         encoding: Encoding = "protobuf",
         ca_file: str | PathLike[str] | None = None,
     ) -> None:
-        """Connects at the first call.
+        """Create a client; it connects at the first call.
 
         Args:
             endpoint: ``grpc://host:port``, ``grpcs://``, ``http://`` or ``https://``; bare ``host:port``
                 is gRPC.
-            token: bearer token; over ``grpc://`` and ``http://`` it travels in clear.
-            timeout: s for a call, its retries included; the server is told what is left of it.
-            retries: how often a call is tried again at most.
+            token: bearer token; over ``grpc://`` and ``http://`` it is sent unencrypted.
+            timeout: seconds for a call, retries included; the server is told the remaining time.
+            retries: max number of retries of a call.
             encoding: ``protobuf`` or ``json`` for REST bodies.
             ca_file: PEM certificates to trust instead of the system's.
 
         Raises:
-            ValueError: an argument is out of its range.
+            ValueError: an argument is out of range.
             OSError: the certificates cannot be read.
         """
         self._settings = ClientSettings(endpoint, token, timeout, retries, encoding=encoding, ca_file=ca_file)
         self._transport = open_transport(self._settings.connection)
 
     def predict(self, request: PredictRequest, timeout: float | None = None) -> PredictResponse:
-        """Forecasts all agents of a scene.
+        """Forecast the agents of a scene.
 
         Args:
-            request: see ``cab_forecast.predict_request``.
-            timeout: s; None: the client's.
+            request: the request, see ``cab_forecast.predict_request``.
+            timeout: seconds; None: the client's.
 
         Raises:
-            ForecastError: there is no answer; its subclass says why.
+            ForecastError: the call failed; the subclass says why.
         """
         return self._call(PREDICT, request, timeout)
 
     def list_models(self, timeout: float | None = None) -> list[Model]:
-        """Every model that is loaded, by name and version.
+        """Return all loaded models, by name and version.
 
         Raises:
-            ForecastError: there is no answer; its subclass says why.
+            ForecastError: the call failed; the subclass says why.
         """
         return list(self._call(LIST_MODELS, ListModelsRequest(), timeout).models)
 
     def get_model(self, name: str, timeout: float | None = None) -> Model:
-        """One model.
+        """Return one model.
 
         Args:
             name: ``name`` (its newest version) or ``name@version``.
-            timeout: s; None: the client's.
+            timeout: seconds; None: the client's.
 
         Raises:
             NotFound: no loaded model has that name.
-            ForecastError: there is no answer; its subclass says why.
+            ForecastError: the call failed; the subclass says why.
             ValueError: the name is empty.
         """
-        return self._call(GET_MODEL, get_model_request(name), timeout).model
+        return self._call(GET_MODEL, _get_model_request(name), timeout).model
 
     def agent_consistency(
         self, scene_id: str, agent_id: str, window: float | None = None, timeout: float | None = None
     ) -> list[InstantConsistency]:
-        """An agent's observations of the last seconds, and what was forecast for them; by ascending time.
+        """Return an agent's recent observations, by time, with how well they were forecast.
 
         Args:
-            scene_id: of the requests that it was in.
-            agent_id: as in those.
-            window: s back from its newest observation; None: 2 s.
-            timeout: s; None: the client's.
+            scene_id: the scene, as in the Predict requests.
+            agent_id: the agent, as in the Predict requests.
+            window: seconds back from the agent's newest observation; None: 2 s.
+            timeout: seconds; None: the client's.
 
         Raises:
-            UnknownTrack: the server remembers nothing of it.
-            TrackingUnavailable: its memory does not answer.
-            ForecastError: there is no answer; its subclass says why.
+            UnknownTrack: the server has no track of that agent.
+            TrackingUnavailable: the track memory does not respond.
+            ForecastError: the call failed; the subclass says why.
         """
         request = GetAgentConsistencyRequest(scene_id=scene_id, agent_id=agent_id, window=window or 0.0)
         return list(self._call(GET_AGENT_CONSISTENCY, request, timeout).instants)
 
     def scene_consistency(self, scene_id: str, timeout: float | None = None) -> GetSceneConsistencyResponse:
-        """The newest observation of every agent of a scene, and its sums by model.
+        """Return the newest observation of every agent of a scene, and aggregates by model.
 
         Args:
-            scene_id: of the requests.
-            timeout: s; None: the client's.
+            scene_id: the scene, as in the Predict requests.
+            timeout: seconds; None: the client's.
 
         Raises:
-            UnknownTrack: the server remembers nothing of it.
-            TrackingUnavailable: its memory does not answer.
-            ForecastError: there is no answer; its subclass says why.
+            UnknownTrack: the server has no track of that scene.
+            TrackingUnavailable: the track memory does not respond.
+            ForecastError: the call failed; the subclass says why.
         """
         return self._call(GET_SCENE_CONSISTENCY, GetSceneConsistencyRequest(scene_id=scene_id), timeout)
 
     def model_consistency(self, timeout: float | None = None) -> list[ModelConsistency]:
-        """What was settled by model, over the life of the server's process.
+        """Return consistency aggregates by model, since the server's process started.
 
         Raises:
-            ForecastError: there is no answer; its subclass says why.
+            ForecastError: the call failed; the subclass says why.
         """
         return list(self._call(LIST_MODEL_CONSISTENCY, ListModelConsistencyRequest(), timeout).models)
 
     def reset_scene(self, scene_id: str, timeout: float | None = None) -> int:
-        """Makes the server forget a scene; how many agents it knew. (A retry finds none left.)
+        """Delete the tracks of a scene; return the number of agents deleted.
+
+        The number is 0 if a first attempt succeeded but its response was lost.
 
         Raises:
-            TrackingUnavailable: its memory does not answer.
-            ForecastError: there is no answer; its subclass says why.
+            TrackingUnavailable: the track memory does not respond.
+            ForecastError: the call failed; the subclass says why.
         """
         return self._call(RESET_SCENE, ResetSceneRequest(scene_id=scene_id), timeout).agents
 
     def watch_scene(self, scene_id: str, timeout: float | None = None) -> Stream[WatchSceneResponse]:
-        """What is found out about a scene from now on, until the server drains or the stream is closed.
+        """Stream a scene's consistency from now on, until the server drains or the stream is closed.
 
         Args:
-            scene_id: of the requests.
-            timeout: s for it to begin; None: the client's. It goes on for as long as it likes.
+            scene_id: the scene, as in the Predict requests.
+            timeout: seconds until the stream starts; None: the client's. The stream itself has no timeout.
 
         Raises:
-            TrackingUnavailable: the server's memory does not answer.
-            Overloaded: too many watch.
-            ForecastError: it does not begin; its subclass says why. Later its iteration raises them.
+            TrackingUnavailable: the track memory does not respond.
+            Overloaded: the server has too many watchers.
+            ForecastError: the stream did not start; the subclass says why. Later errors are raised by its
+                iteration.
         """
         budget = self._settings.budget(timeout)
         request = WatchSceneRequest(scene_id=scene_id)
-        stream: Stream[WatchSceneResponse] = self._attempts(budget)(
+        stream: Stream[WatchSceneResponse] = self._retrying(budget)(
             self._transport.open, WATCH_SCENE, request, budget
         )
         return stream
 
     def close(self) -> None:
-        """Frees the connections; calls after it raise RuntimeError."""
+        """Close the connections; later calls raise RuntimeError."""
         self._settings.closed = True
         self._transport.close()
 
@@ -191,12 +200,127 @@ class Client:
     ) -> None:
         self.close()
 
-    def _call(self, method: Method[Request, Response], request: Request, timeout: float | None) -> Response:
+    def _call(self, route: Route[Request, Response], request: Request, timeout: float | None) -> Response:
         budget = self._settings.budget(timeout)
-        answer: Response = self._attempts(budget)(self._transport.call, method, request, budget)
-        return answer
+        response: Response = self._retrying(budget)(self._transport.call, route, request, budget)
+        return response
 
-    def _attempts(self, budget: Budget) -> tenacity.Retrying:
+    def _retrying(self, budget: Budget) -> tenacity.Retrying:
         return tenacity.Retrying(
-            stop=stop(self._settings.retries, budget), wait=WAIT, retry=RETRY, reraise=True
+            stop=stop_condition(self._settings.retries, budget), wait=WAIT, retry=RETRY, reraise=True
         )
+
+
+class AsyncClient:
+    """``Client`` for asyncio: the same arguments, calls and errors; used within one event loop."""
+
+    def __init__(
+        self,
+        endpoint: str = DEFAULT_ENDPOINT,
+        token: str | None = None,
+        timeout: float = DEFAULT_TIMEOUT,
+        retries: int = DEFAULT_RETRIES,
+        *,
+        encoding: Encoding = "protobuf",
+        ca_file: str | PathLike[str] | None = None,
+    ) -> None:
+        """See ``Client``."""
+        self._settings = ClientSettings(endpoint, token, timeout, retries, encoding=encoding, ca_file=ca_file)
+        # Opened at the first call, because a channel belongs to the event loop that it is created in.
+        self._transport: AsyncTransport | None = None
+
+    async def predict(self, request: PredictRequest, timeout: float | None = None) -> PredictResponse:  # noqa: ASYNC109 - it goes to the server, too
+        """See ``Client.predict``."""
+        return await self._call(PREDICT, request, timeout)
+
+    async def list_models(self, timeout: float | None = None) -> list[Model]:  # noqa: ASYNC109
+        """See ``Client.list_models``."""
+        return list((await self._call(LIST_MODELS, ListModelsRequest(), timeout)).models)
+
+    async def get_model(self, name: str, timeout: float | None = None) -> Model:  # noqa: ASYNC109
+        """See ``Client.get_model``."""
+        return (await self._call(GET_MODEL, _get_model_request(name), timeout)).model
+
+    async def agent_consistency(
+        self,
+        scene_id: str,
+        agent_id: str,
+        window: float | None = None,
+        timeout: float | None = None,  # noqa: ASYNC109
+    ) -> list[InstantConsistency]:
+        """See ``Client.agent_consistency``."""
+        request = GetAgentConsistencyRequest(scene_id=scene_id, agent_id=agent_id, window=window or 0.0)
+        return list((await self._call(GET_AGENT_CONSISTENCY, request, timeout)).instants)
+
+    async def scene_consistency(
+        self,
+        scene_id: str,
+        timeout: float | None = None,  # noqa: ASYNC109
+    ) -> GetSceneConsistencyResponse:
+        """See ``Client.scene_consistency``."""
+        return await self._call(GET_SCENE_CONSISTENCY, GetSceneConsistencyRequest(scene_id=scene_id), timeout)
+
+    async def model_consistency(self, timeout: float | None = None) -> list[ModelConsistency]:  # noqa: ASYNC109
+        """See ``Client.model_consistency``."""
+        return list((await self._call(LIST_MODEL_CONSISTENCY, ListModelConsistencyRequest(), timeout)).models)
+
+    async def reset_scene(self, scene_id: str, timeout: float | None = None) -> int:  # noqa: ASYNC109
+        """See ``Client.reset_scene``."""
+        return (await self._call(RESET_SCENE, ResetSceneRequest(scene_id=scene_id), timeout)).agents
+
+    def watch_scene(self, scene_id: str, timeout: float | None = None) -> AsyncStream[WatchSceneResponse]:
+        """See ``Client.watch_scene``.
+
+        Unlike there, the call starts with ``async with`` or the first message, and raises errors then.
+        """
+        request = WatchSceneRequest(scene_id=scene_id)
+
+        async def start() -> OpenStream[WatchSceneResponse]:
+            budget = self._settings.budget(timeout)
+            opened: OpenStream[WatchSceneResponse] = await self._retrying(budget)(
+                self._open_transport().open, WATCH_SCENE, request, budget
+            )
+            return opened
+
+        return AsyncStream(start)
+
+    async def close(self) -> None:
+        """See ``Client.close``."""
+        self._settings.closed = True
+        if self._transport is not None:
+            await self._transport.close()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    async def _call(
+        self,
+        route: Route[Request, Response],
+        request: Request,
+        timeout: float | None,  # noqa: ASYNC109
+    ) -> Response:
+        budget = self._settings.budget(timeout)
+        transport = self._open_transport()
+        response: Response = await self._retrying(budget)(transport.call, route, request, budget)
+        return response
+
+    def _open_transport(self) -> AsyncTransport:
+        if self._transport is None:
+            self._transport = open_async_transport(self._settings.connection)
+        return self._transport
+
+    def _retrying(self, budget: Budget) -> tenacity.AsyncRetrying:
+        return tenacity.AsyncRetrying(
+            stop=stop_condition(self._settings.retries, budget), wait=WAIT, retry=RETRY, reraise=True
+        )
+
+
+def _get_model_request(name: str) -> GetModelRequest:
+    if not name:  # it would be the path of the list
+        raise ValueError("the model's name is empty")
+    return GetModelRequest(name=name)

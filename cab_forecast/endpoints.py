@@ -1,36 +1,36 @@
-"""Where a server is, and which transport reaches it."""
+"""Endpoints of servers. The command line imports this at its start, so it imports nothing heavy."""
 
 from dataclasses import dataclass
 from typing import Literal
 from urllib.parse import urlsplit
 
 DEFAULT_ENDPOINT = "grpc://127.0.0.1:50051"
-"""Where `cab-forecast serve` listens by default."""
+"""Address that `cab-forecast serve` listens on by default."""
 _DEFAULT_GRPC_PORT = 50051
 _SCHEMES = ("grpc", "grpcs", "http", "https")
 
 
 @dataclass(frozen=True)
 class Endpoint:
-    """A server's address."""
+    """Address of a server."""
 
     url: str
-    """As people read it, e.g. ``grpc://127.0.0.1:50051``; without credentials."""
+    """URL for people, e.g. ``grpc://127.0.0.1:50051``; without credentials."""
     transport: Literal["grpc", "rest"]
     secure: bool
-    """Whether TLS is spoken."""
+    """Whether the connection uses TLS."""
     target: str
-    """``host:port`` for gRPC; the base URL, without a slash at its end, for REST."""
+    """``host:port`` for gRPC; the base URL, without a trailing slash, for REST."""
 
 
 def parse_endpoint(endpoint: str) -> Endpoint:
-    """Reads ``grpc://host:port``, ``grpcs://``, ``http://``, ``https://``; bare ``host:port`` is gRPC.
+    """Parse ``grpc://host:port``, ``grpcs://``, ``http://`` or ``https://``; bare ``host:port`` is gRPC.
 
-    The port may be left out: 50051 for gRPC, the scheme's own for HTTP. An HTTP URL may have a path, in
-    front of which a gateway serves the REST interface.
+    The port may be omitted: 50051 for gRPC, the scheme's own for HTTP. An HTTP URL may have a path, for
+    gateways that serve the REST interface below one.
 
     Raises:
-        ValueError: another scheme, no host, a bad port, or parts that an endpoint cannot have.
+        ValueError: unknown scheme, no host, invalid port, or parts that an endpoint cannot have.
     """
     address = endpoint if "://" in endpoint else f"grpc://{endpoint}"
     parts = urlsplit(address)
@@ -47,7 +47,7 @@ def parse_endpoint(endpoint: str) -> Endpoint:
         raise ValueError(f"endpoint {endpoint!r}: no host")
     if parts.username is not None or parts.query or parts.fragment:
         raise ValueError(f"endpoint {endpoint!r}: only scheme, host, port and, for HTTP, a path are allowed")
-    if ":" in host:  # IPv6 keeps its brackets
+    if ":" in host:  # IPv6 addresses keep their brackets
         host = f"[{host}]"
     path = parts.path.rstrip("/")
     if parts.scheme in ("grpc", "grpcs"):

@@ -1,13 +1,13 @@
-"""What can go wrong with a call: one exception tree, the same for gRPC and REST."""
+"""Exceptions of calls: one tree, the same for gRPC and REST."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
 TOO_LARGE = "TOO_LARGE"
-"""Reason of a RESOURCE_EXHAUSTED that no retry can mend."""
+"""Reason of a RESOURCE_EXHAUSTED that a retry cannot fix."""
 UNREACHABLE = "UNREACHABLE"
-"""Reason of an UNAVAILABLE that the client itself found: there is no connection to the server."""
+"""Reason of an UNAVAILABLE that the client raises itself, without a connection to the server."""
 
 
 @dataclass(frozen=True)
@@ -15,25 +15,25 @@ class FieldViolation:
     """One field that the server refused."""
 
     field: str
-    """Where it is in the request, e.g. ``agents[3].states[1].x``."""
+    """Path in the request, e.g. ``agents[3].states[1].x``."""
     description: str
-    """What is wrong with it."""
+    """Reason of the refusal."""
 
 
 class ForecastError(Exception):
-    """A call that brought no answer.
+    """A failed call.
 
     Attributes:
         code: canonical status code by name, e.g. ``INVALID_ARGUMENT``; the same on both transports.
-        message: the server's sentence, or the client's when there was no server.
-        reason: machine-readable cause in the server's own words, e.g. ``BAD_FIELD``; may be empty.
+        message: the server's message, or the client's if there was no response.
+        reason: machine-readable cause from the server, e.g. ``BAD_FIELD``; may be empty.
         field_violations: the fields that were refused.
-        retry_after: s to wait before trying again, if the server said so.
+        retry_after: seconds to wait before a retry; None: the server did not say.
     """
 
     default_code: ClassVar[str] = "UNKNOWN"
     retryable: ClassVar[bool] = False
-    """Whether the same request may succeed in a moment."""
+    """Whether the same request may succeed shortly afterwards."""
 
     def __init__(
         self,
@@ -52,35 +52,37 @@ class ForecastError(Exception):
         self.retry_after = retry_after
 
     def __str__(self) -> str:
-        """The message, then each refused field that it does not name itself."""
-        untold = [f"{v.field}: {v.description}" for v in self.field_violations if v.field not in self.message]
-        return "; ".join([self.message, *untold])
+        """Return the message, then each refused field that it does not name."""
+        unnamed = [
+            f"{v.field}: {v.description}" for v in self.field_violations if v.field not in self.message
+        ]
+        return "; ".join([self.message, *unnamed])
 
 
-class BadRequest(ForecastError):  # noqa: N818 - named by what happened, as the status codes are
-    """A field of the request is wrong; ``field_violations`` names it."""
+class BadRequest(ForecastError):  # noqa: N818 - named like the status codes
+    """Fields of the request are invalid; ``field_violations`` names them."""
 
     default_code = "INVALID_ARGUMENT"
 
 
 class Unauthenticated(ForecastError):  # noqa: N818
-    """The token is missing or wrong."""
+    """The token is missing or not valid."""
 
     default_code = "UNAUTHENTICATED"
 
 
 class NotFound(ForecastError):  # noqa: N818
-    """No such model; ``UnknownTrack`` for scenes and agents."""
+    """No such model. For scenes and agents see ``UnknownTrack``."""
 
     default_code = "NOT_FOUND"
 
 
 class UnknownTrack(NotFound):
-    """The server remembers nothing of that scene or agent."""
+    """The server has no track of that scene or agent."""
 
 
 class TooLarge(ForecastError):  # noqa: N818
-    """The request exceeds a size limit of the server; sending it again is of no use."""
+    """The request exceeds a size limit of the server; a retry cannot succeed."""
 
     default_code = "RESOURCE_EXHAUSTED"
 
@@ -93,7 +95,7 @@ class Overloaded(ForecastError):  # noqa: N818
 
 
 class DeadlineExceeded(ForecastError):  # noqa: N818
-    """The call's timeout passed before an answer came."""
+    """The call's timeout passed before a response arrived."""
 
     default_code = "DEADLINE_EXCEEDED"
 
@@ -106,11 +108,11 @@ class Unavailable(ForecastError):  # noqa: N818
 
 
 class TrackingUnavailable(Unavailable):
-    """The server's track memory does not answer; forecasts go on without it."""
+    """The server's track memory does not respond; forecasts go on without it."""
 
 
 class InternalError(ForecastError):
-    """The server failed, or its answer cannot be read."""
+    """The server failed, or its response cannot be parsed."""
 
     default_code = "INTERNAL"
 
@@ -123,7 +125,7 @@ _BY_CODE: dict[str, type[ForecastError]] = {
     "RESOURCE_EXHAUSTED": Overloaded,
     "DEADLINE_EXCEEDED": DeadlineExceeded,
     "UNAVAILABLE": Unavailable,
-    # So a gRPC server that stops ends calls that it has not begun; a client's own cancelling is no error
+    # A gRPC server that stops cancels calls that it has not started. A client's own cancellation is no error.
     "CANCELLED": Unavailable,
     "INTERNAL": InternalError,
     "DATA_LOSS": InternalError,
@@ -133,7 +135,7 @@ _BY_REASON: dict[tuple[str, str], type[ForecastError]] = {
     ("NOT_FOUND", "UNKNOWN_TRACK"): UnknownTrack,
     ("UNAVAILABLE", "TRACKING_UNAVAILABLE"): TrackingUnavailable,
 }
-"""What is told apart from others of its code by its reason."""
+"""Exceptions that differ from others with the same code by their reason."""
 
 
 def error_for(
@@ -144,14 +146,14 @@ def error_for(
     field_violations: Sequence[FieldViolation] = (),
     retry_after: float | None = None,
 ) -> ForecastError:
-    """The exception for a status; codes outside the contract become a plain ``ForecastError``.
+    """Return the exception for a status; codes outside the contract become a plain ``ForecastError``.
 
     Args:
         code: canonical status code by name.
-        message: what happened, for people.
-        reason: the server's ErrorInfo reason.
-        field_violations: fields that were refused.
-        retry_after: s.
+        message: message for people.
+        reason: reason from the server's ErrorInfo.
+        field_violations: fields that the server refused.
+        retry_after: seconds; None: the server did not say.
     """
     kind = _BY_REASON.get((code, reason)) or _BY_CODE.get(code, ForecastError)
     return kind(message, code=code, reason=reason, field_violations=field_violations, retry_after=retry_after)

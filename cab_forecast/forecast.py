@@ -1,6 +1,6 @@
-"""Forecasts as numpy arrays."""
+"""Forecasts as numpy arrays, and the contract's enums as Python values and words."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -8,17 +8,17 @@ import numpy as np
 import numpy.typing as npt
 
 from cab.forecast.v1.consistency_service_pb2 import InstantConsistency, TrackingStatus
-from cab.forecast.v1.model_service_pb2 import ModelReference
+from cab.forecast.v1.model_service_pb2 import AgentType, InputProtocol, ModelReference
 from cab.forecast.v1.prediction_service_pb2 import AgentForecast, ForecastStatus, PredictResponse
 
 _Floats = npt.NDArray[np.float64]
 
 
 class Status(StrEnum):
-    """How an agent's forecast came out."""
+    """Status of an agent's forecast."""
 
     UNSPECIFIED = "UNSPECIFIED"
-    """Something that this client does not know of yet."""
+    """A status that this client does not know."""
     OK = "OK"
     SHORT_HISTORY = "SHORT_HISTORY"
     FALLBACK = "FALLBACK"
@@ -26,41 +26,41 @@ class Status(StrEnum):
 
 
 class Tracking(StrEnum):
-    """What became of the server's memory of an agent or a scene in a call."""
+    """Status of the track memory of an agent or a scene in a call."""
 
     UNSPECIFIED = "UNSPECIFIED"
-    """Not tracked, or something that this client does not know of yet."""
+    """Not tracked, or a status that this client does not know."""
     OK = "OK"
     NEW = "NEW"
     RESET = "RESET"
-    """What was remembered did not fit, or was gone."""
+    """The track was inconsistent with the request, or lost, and starts anew."""
     UNAVAILABLE = "UNAVAILABLE"
-    """The memory did not answer in time."""
+    """The track memory did not respond in time."""
 
 
 @dataclass(frozen=True)
 class Forecast:
     """A Gaussian mixture over one agent's future positions: K modes, T steps; ground frame.
 
-    With status INVALID there is none: K is 0.
+    With status INVALID there is no forecast: K is 0.
     """
 
     agent_id: str
     status: Status
     detail: str
-    """Why the status is not OK."""
+    """Reason for a status other than OK."""
     field: str
-    """With INVALID: the field that is wrong."""
+    """With INVALID: the invalid field."""
     model: ModelReference
-    """The model that made it; with FALLBACK another one than was asked for."""
+    """The model that made the forecast; with FALLBACK not the requested one."""
     history_frames: int
-    """History frames that it rests on, the present one included."""
+    """Number of history frames used, the present one included."""
     times: _Floats
-    """[T], s since the epoch."""
+    """[T], seconds since the epoch."""
     mode_ids: npt.NDArray[np.int64]
     """[K], the model's own numbers of the modes."""
     weights: _Floats
-    """[K]; with ``remaining_weight`` they sum to 1."""
+    """[K], probabilities; they sum to 1 together with ``remaining_weight``."""
     remaining_weight: float
     """Probability of the modes that were not returned."""
     means: _Floats
@@ -68,18 +68,17 @@ class Forecast:
     covariances: _Floats
     """[K, T, 2, 2], m²."""
     most_likely_mode: int
-    """Index of the mode of greatest weight."""
+    """Index of the mode with the greatest weight."""
     samples: _Floats
     """[S, T, 2], m."""
     tracking: Tracking
-    """What became of the memory of this agent."""
+    """Status of this agent's track."""
     consistency: InstantConsistency | None
-    """What the model said before about the agent's newest observation; None: it was not asked for, or there
-    is nothing."""
+    """Consistency of the forecasts of the agent's newest observation; None: not requested or not known."""
 
     @property
     def most_likely(self) -> _Floats:
-        """[T, 2], the means of the likeliest mode, m.
+        """Means of the most likely mode: [T, 2], m.
 
         Raises:
             ValueError: there is no forecast.
@@ -91,15 +90,14 @@ class Forecast:
 
     @property
     def ranked_modes(self) -> npt.NDArray[np.int64]:
-        """[K], indices of the modes, the likeliest first."""
+        """Indices of the modes, the most likely first: [K]."""
         return np.argsort(-self.weights, kind="stable")
 
 
 def forecasts(response: PredictResponse) -> dict[str, Forecast]:
-    """The forecasts of a call by agent id, in the request's order.
+    """Return the forecasts of a response by agent id, in the request's order.
 
-    Should the server report an id twice (the second time as INVALID, for being one too many), the first
-    report stays.
+    If the request holds an id twice, the server reports the second agent as INVALID; the first one is kept.
 
     Raises:
         ValueError: sizes in the response contradict each other.
@@ -110,12 +108,27 @@ def forecasts(response: PredictResponse) -> dict[str, Forecast]:
     return found
 
 
-def tracking(answer: PredictResponse | AgentForecast) -> Tracking:
-    """What became of the memory of a call's scene, or of an agent in it."""
-    number = answer.tracking
-    # A newer server may know more of them.
+def tracking(message: PredictResponse | AgentForecast) -> Tracking:
+    """Return the status of the track memory, of a response's scene or of one agent."""
+    number = message.tracking
+    # A newer server may have more of them.
     name = TrackingStatus.Name(number) if number in TrackingStatus.values() else ""
     return Tracking.__members__.get(name.removeprefix("TRACKING_STATUS_"), Tracking.UNSPECIFIED)
+
+
+def type_name(number: int) -> str:
+    """Return an AgentType in words, e.g. ``vehicle``; ``unspecified`` if this client does not know it."""
+    return _name(AgentType.items(), "AGENT_TYPE_", number)
+
+
+def protocol_name(number: int) -> str:
+    """Return an InputProtocol in words, e.g. ``causal``; ``unspecified`` if this client does not know it."""
+    return _name(InputProtocol.items(), "INPUT_PROTOCOL_", number)
+
+
+def model_name(model: ModelReference) -> str:
+    """Return ``name@version``, or the name alone if there is no version."""
+    return f"{model.name}@{model.version}" if model.version else model.name
 
 
 def _forecast(entry: AgentForecast, response: PredictResponse) -> Forecast:
@@ -154,6 +167,11 @@ def _shaped(entry: AgentForecast, name: str, values: Sequence[float], shape: tup
 
 
 def _status(number: int) -> Status:
-    # A newer server may know more of them.
+    # A newer server may have more of them.
     name = ForecastStatus.Name(number) if number in ForecastStatus.values() else ""  # type: ignore[arg-type]
     return Status.__members__.get(name.removeprefix("FORECAST_STATUS_"), Status.UNSPECIFIED)
+
+
+def _name(items: Iterable[tuple[str, int]], prefix: str, number: int) -> str:
+    known = {value: name.removeprefix(prefix).lower() for name, value in items}
+    return known.get(number, "unspecified")

@@ -1,4 +1,4 @@
-"""Calls over gRPC."""
+"""gRPC transports: a blocking one, and one for asyncio."""
 
 import asyncio
 import threading
@@ -13,23 +13,23 @@ from grpc import aio
 from grpc.aio import EOF  # type: ignore[attr-defined]  # the stubs lack it
 from grpc_status import rpc_status
 
+from cab.forecast.v1.routes import Request, Response, Route
+from cab_forecast.connection import Connection
 from cab_forecast.endpoints import Endpoint
 from cab_forecast.errors import TOO_LARGE, UNREACHABLE, FieldViolation, ForecastError, error_for
-from cab_forecast.methods import Method, Request, Response
-from cab_forecast.streams import Opened, Stream
+from cab_forecast.streams import OpenStream, Stream
 from cab_forecast.timing import Budget
-from cab_forecast.transport import Connection
 
 _OPTIONS: Sequence[tuple[str, int]] = (
-    # Hundreds of agents with samples pass the 4 MiB that gRPC allows by default; the server has limits.
+    # Responses for hundreds of agents with samples exceed gRPC's default of 4 MiB; the server limits them.
     ("grpc.max_receive_message_length", -1),
-    # The client retries by itself, with the server's word on when.
+    # The client retries by itself, after the time that the server asks for.
     ("grpc.enable_retries", 0),
-    # A channel whose server went away looks for it again as quickly as the client's retries do.
+    # Reconnect to a server that went away as quickly as the client retries.
     ("grpc.initial_reconnect_backoff_ms", 100),
     ("grpc.min_reconnect_backoff_ms", 100),
     ("grpc.max_reconnect_backoff_ms", 2000),
-    # While calls are open that say nothing for long, whether the server is still there is asked.
+    # Check that the server is alive while calls are open, so that idle streams notice a lost connection.
     ("grpc.keepalive_time_ms", 20_000),
     ("grpc.keepalive_timeout_ms", 20_000),
     ("grpc.http2.max_pings_without_data", 0),
@@ -37,7 +37,7 @@ _OPTIONS: Sequence[tuple[str, int]] = (
 
 
 class GrpcTransport:
-    """Blocking calls over one channel; usable from several threads."""
+    """Blocking transport over one channel; usable from several threads."""
 
     def __init__(self, connection: Connection) -> None:
         endpoint = connection.endpoint
@@ -49,33 +49,33 @@ class GrpcTransport:
             else grpc.insecure_channel(endpoint.target, _OPTIONS)
         )
 
-    def call(self, method: Method[Request, Response], request: Request, budget: Budget) -> Response:
-        """As ``Transport.call``."""
-        invoke = self._channel.unary_unary(method.rpc, _serialize, method.response.FromString)
+    def call(self, route: Route[Request, Response], request: Request, budget: Budget) -> Response:
+        """See ``Transport.call``."""
+        invoke = self._channel.unary_unary(route.rpc, _serialize, route.response.FromString)
         try:
-            answer: Response = invoke(request, timeout=budget.remaining(), metadata=self._metadata)
+            response: Response = invoke(request, timeout=budget.remaining(), metadata=self._metadata)
         except grpc.RpcError as error:
             raise error_from_call(error, self._endpoint) from error
-        return answer
+        return response
 
-    def open(self, method: Method[Request, Response], request: Request, budget: Budget) -> Stream[Response]:
-        """As ``Transport.open``."""
-        invoke = self._channel.unary_stream(method.rpc, _serialize, method.response.FromString)
-        left = budget.remaining()  # the call itself has no deadline
-        # An iterator and a call, of which the stubs know the first
+    def open(self, route: Route[Request, Response], request: Request, budget: Budget) -> Stream[Response]:
+        """See ``Transport.open``."""
+        invoke = self._channel.unary_stream(route.rpc, _serialize, route.response.FromString)
+        left = budget.remaining()  # bounds the start only: the call itself has no deadline
+        # Both an iterator and a call; the stubs know the iterator only.
         call: Any = invoke(request, metadata=self._metadata)
         late = threading.Event()
 
-        def give_up() -> None:
+        def time_out() -> None:
             late.set()
             call.cancel()
 
-        timer = threading.Timer(left, give_up)  # nothing else bounds how long a message is waited for
+        timer = threading.Timer(left, time_out)  # nothing else bounds the wait for the first message
         timer.start()
         try:
             first = next(call, None)
         except grpc.RpcError as error:
-            raise budget.exceeded() if late.is_set() else error_from_call(error, self._endpoint) from error
+            raise (budget.exceeded() if late.is_set() else error_from_call(error, self._endpoint)) from error
         except BaseException:
             call.cancel()
             raise
@@ -84,12 +84,12 @@ class GrpcTransport:
         return Stream(_messages(call, first, self._endpoint), call.cancel)
 
     def close(self) -> None:
-        """As ``Transport.close``."""
+        """See ``Transport.close``."""
         self._channel.close()
 
 
 class AsyncGrpcTransport:
-    """Calls over one channel, for asyncio; made and used in one event loop."""
+    """Transport over one channel, for asyncio; created and used in one event loop."""
 
     def __init__(self, connection: Connection) -> None:
         endpoint = connection.endpoint
@@ -101,20 +101,20 @@ class AsyncGrpcTransport:
             else aio.insecure_channel(endpoint.target, _OPTIONS)
         )
 
-    async def call(self, method: Method[Request, Response], request: Request, budget: Budget) -> Response:
-        """As ``AsyncTransport.call``."""
-        invoke = self._channel.unary_unary(method.rpc, _serialize, method.response.FromString)
+    async def call(self, route: Route[Request, Response], request: Request, budget: Budget) -> Response:
+        """See ``AsyncTransport.call``."""
+        invoke = self._channel.unary_unary(route.rpc, _serialize, route.response.FromString)
         try:
-            answer: Response = await invoke(request, timeout=budget.remaining(), metadata=self._metadata)
+            response: Response = await invoke(request, timeout=budget.remaining(), metadata=self._metadata)
         except aio.AioRpcError as error:
             raise error_from_call(error, self._endpoint) from error
-        return answer
+        return response
 
     async def open(
-        self, method: Method[Request, Response], request: Request, budget: Budget
-    ) -> Opened[Response]:
-        """As ``AsyncTransport.open``."""
-        invoke = self._channel.unary_stream(method.rpc, _serialize, method.response.FromString)
+        self, route: Route[Request, Response], request: Request, budget: Budget
+    ) -> OpenStream[Response]:
+        """See ``AsyncTransport.open``."""
+        invoke = self._channel.unary_stream(route.rpc, _serialize, route.response.FromString)
         left = budget.remaining()
         call = invoke(request, metadata=self._metadata)
         try:
@@ -129,18 +129,18 @@ class AsyncGrpcTransport:
             call.cancel()
             raise
 
-        async def hang_up() -> None:
+        async def cancel() -> None:
             call.cancel()
 
-        return Opened(_async_messages(call, first, self._endpoint), hang_up)
+        return OpenStream(_async_messages(call, first, self._endpoint), cancel)
 
     async def close(self) -> None:
-        """As ``AsyncTransport.close``."""
+        """See ``AsyncTransport.close``."""
         await self._channel.close(None)
 
 
 def _messages(call: Iterator[Response], first: Response | None, endpoint: Endpoint) -> Iterator[Response]:
-    """What the first message and those after it tell; an empty one tells that the call has begun."""
+    """Yield all messages except empty ones, which only say that the call has started."""
     message = first
     try:
         while message is not None:
@@ -154,7 +154,7 @@ def _messages(call: Iterator[Response], first: Response | None, endpoint: Endpoi
 async def _async_messages(
     call: "aio.UnaryStreamCall[Request, Response]", first: Any, endpoint: Endpoint
 ) -> AsyncGenerator[Response]:
-    """As ``_messages``."""
+    """See ``_messages``."""
     message = first
     try:
         while message is not EOF:
@@ -166,11 +166,11 @@ async def _async_messages(
 
 
 def error_from_call(call: grpc.RpcError, endpoint: Endpoint) -> ForecastError:
-    """The exception for a failed call, from its status and the google.rpc details in its trailers.
+    """Return the exception for a failed call, from its status and the google.rpc details in its trailers.
 
     Args:
-        call: what gRPC raised; it is the ended call as well.
-        endpoint: named when the server could not be reached.
+        call: the error that gRPC raised, which is the ended call as well.
+        endpoint: the endpoint, for the message if the server could not be reached.
     """
     code, message = call.code().name, call.details() or ""
     reason, retry_after = "", None
@@ -185,10 +185,10 @@ def error_from_call(call: grpc.RpcError, endpoint: Endpoint) -> ForecastError:
         elif detail.Unpack(retry):
             retry_after = retry.retry_delay.ToNanoseconds() / 1e9
     if not details and code == "UNAVAILABLE":
-        # The server's own UNAVAILABLE has details; this one is the channel's.
+        # The server's own UNAVAILABLE has details; this one comes from the channel.
         message, reason = f"no connection to {endpoint.url}: {message}", UNREACHABLE
     elif not details and code == "RESOURCE_EXHAUSTED" and "larger than max" in message:
-        # gRPC's own limit refuses a message before the server's code sees it.
+        # gRPC's own size limit refused the message before the server's code could.
         reason = TOO_LARGE
     return error_for(
         code, message or code, reason=reason, field_violations=violations, retry_after=retry_after
@@ -197,8 +197,8 @@ def error_from_call(call: grpc.RpcError, endpoint: Endpoint) -> ForecastError:
 
 def _details(call: grpc.RpcError) -> Sequence[any_pb2.Any]:
     try:
-        status = rpc_status.from_call(call)  # type: ignore[arg-type] # what is raised is the call
-    except ValueError:  # details that contradict the status: the status is what counts
+        status = rpc_status.from_call(call)  # type: ignore[arg-type] # the error is the call
+    except ValueError:  # the details contradict the status, which takes precedence
         return ()
     return status.details if status else ()
 

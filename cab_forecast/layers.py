@@ -1,4 +1,4 @@
-"""The map's three binary layers, to and from the bytes of the contract."""
+"""Encoding and decoding of a map's three binary layers."""
 
 import io
 from typing import Any, Literal
@@ -19,13 +19,13 @@ _PNG_THRESHOLD = 128
 
 
 def as_layers(layers: npt.ArrayLike) -> Layers:
-    """Checks and converts map layers.
+    """Check map layers and convert them to booleans.
 
     Args:
-        layers: [3, rows, columns], booleans or numbers of which only 0 and 1 occur.
+        layers: [3, rows, columns], booleans, or numbers that are 0 or 1.
 
     Raises:
-        ValueError: another shape, or other values.
+        ValueError: the shape or a value is not valid.
     """
     array: npt.NDArray[Any] = np.asarray(layers)
     if array.ndim != _COUNT or array.shape[0] != _COUNT or 0 in array.shape:
@@ -36,14 +36,14 @@ def as_layers(layers: npt.ArrayLike) -> Layers:
 
 
 def encode_layers(layers: npt.ArrayLike, encoding: ImageEncoding = "packed_bits") -> LayerImage:
-    """Map layers as the contract's bytes.
+    """Encode map layers.
 
     Args:
         layers: [3, rows, columns], binary.
-        encoding: ``packed_bits`` is quick to read; ``png`` is many times smaller.
+        encoding: ``packed_bits`` is faster to read; ``png`` is many times smaller.
 
     Raises:
-        ValueError: layers of another shape, or an unknown encoding.
+        ValueError: the layers are not binary or have another shape, or the encoding is unknown.
     """
     array = as_layers(layers)
     if encoding == "packed_bits":
@@ -57,15 +57,15 @@ def encode_layers(layers: npt.ArrayLike, encoding: ImageEncoding = "packed_bits"
 
 
 def decode_layers(image: LayerImage, rows: int, columns: int) -> Layers:
-    """The layers in the contract's bytes: [3, rows, columns].
+    """Decode map layers: [3, rows, columns].
 
     Args:
-        image: packed bits, or PNG.
-        rows: needed with packed bits; with a PNG 0 means whatever it has.
-        columns: likewise.
+        image: packed bits, or a PNG.
+        rows: number of rows; 0, for a PNG only: the image's own.
+        columns: number of columns; 0, for a PNG only: the image's own.
 
     Raises:
-        ValueError: no image, or one of another size.
+        ValueError: there is no image, or its size differs.
     """
     if image.WhichOneof("encoding") == "png":
         pixels = np.asarray(Image.open(io.BytesIO(image.png)).convert("RGB"))

@@ -1,7 +1,7 @@
-"""Requests from numpy arrays and plain Python.
+"""Builders of requests, from numpy arrays and plain Python.
 
-The builders look at shapes, which only they can see; values are the server's to judge, with one voice
-for every client.
+The builders check shapes, which are lost in a message. Values are checked by the server, so that all clients
+follow the same rules.
 """
 
 import math
@@ -28,10 +28,11 @@ from cab.forecast.v1.prediction_service_pb2 import (
 from cab_forecast.layers import ImageEncoding, as_layers, encode_layers
 
 TypeName = Literal["vehicle", "pedestrian", "cyclist", "unknown"]
+Context = Literal["full", "blind"]
 History = Literal["request", "memory"]
 
 PIXELS_PER_METER = 3.0
-"""Resolution of a near patch; a raster of the same loses nothing when the server cuts patches from it."""
+"""Resolution of a near patch. A raster of the same resolution loses no detail when the server crops it."""
 
 _Floats = npt.NDArray[np.float64]
 
@@ -47,29 +48,35 @@ def agent(
     accelerations: npt.ArrayLike | None = None,
     heading_rates: npt.ArrayLike | None = None,
     predict: bool = True,
-    patch: MapPatch | None = None,
+    map_patch: MapPatch | None = None,
     far_map_patch: MapPatch | None = None,
+    patch: MapPatch | None = None,
 ) -> Agent:
-    """An agent and its history, F observations, oldest first.
+    """Build an agent with its history of F observations, oldest first.
 
-    In the optional arrays NaN means: not observed at that time.
+    In the optional arrays NaN means that the value was not observed at that time.
 
     Args:
         agent_id: unique within the request.
         agent_type: what kind of road user it is.
-        times: [F], s since the epoch, ascending.
+        times: [F], seconds since the epoch, ascending.
         positions: [F, 2], m, ground frame.
         headings: [F], rad counter-clockwise from the ground frame's x axis.
         velocities: [F, 2], m/s, ground frame.
         accelerations: [F, 2], m/s², ground frame.
         heading_rates: [F], rad/s.
-        predict: False makes it a neighbour for the others, without a forecast of its own.
-        patch: its own map, see ``map_patch``; goes before the scene's raster.
-        far_map_patch: its own map of what lies farther, likewise; only models that look so far read it.
+        predict: whether to forecast the agent; False: it is only a neighbour of the others.
+        map_patch: its own map, see ``map_patch``; takes precedence over the scene's raster.
+        far_map_patch: its own map at a larger scale; only some models use it.
+        patch: alias of ``map_patch``.
 
     Raises:
-        ValueError: an unknown type, or arrays whose shapes do not fit each other.
+        ValueError: the type is unknown, shapes do not match, or both ``map_patch`` and ``patch`` are given.
     """
+    if patch is not None:
+        if map_patch is not None:
+            raise ValueError(f"agent {agent_id!r}: give either map_patch or its alias patch, not both")
+        map_patch = patch
     stamps = np.atleast_1d(np.asarray(times, dtype=np.float64))
     if stamps.ndim != 1:
         raise ValueError(f"agent {agent_id!r}: times must be [F], but are {list(stamps.shape)}")
@@ -94,7 +101,7 @@ def agent(
         type=_type_number(agent_type),
         states=states,
         predict=predict,
-        map_patch=patch,
+        map_patch=map_patch,
         far_map_patch=far_map_patch,
     )
 
@@ -105,17 +112,17 @@ def scene_raster(
     pixels_per_meter: float = PIXELS_PER_METER,
     encoding: ImageEncoding = "packed_bits",
 ) -> SceneRaster:
-    """The map of a whole scene; the server cuts each agent's view from it.
+    """Build the map of a whole scene, from which the server crops a patch for each agent.
 
     Args:
         layers: [3, rows, columns], binary: driveable area, road dividers, lane dividers. Element
             [layer, i, j] shows the ground point ``origin + (i, j) / pixels_per_meter``: rows run along x.
         origin: ground position of element [·, 0, 0], m.
         pixels_per_meter: resolution.
-        encoding: ``packed_bits``, or ``png``, which is smaller and takes longer.
+        encoding: ``packed_bits``, or ``png``, which is smaller and slower.
 
     Raises:
-        ValueError: layers that are not binary or not [3, rows, columns], or an unknown encoding.
+        ValueError: the layers are not binary or not [3, rows, columns], or the encoding is unknown.
     """
     array = as_layers(layers)
     origin_x, origin_y = origin
@@ -130,16 +137,16 @@ def scene_raster(
 
 
 def map_patch(layers: npt.ArrayLike, encoding: ImageEncoding = "packed_bits") -> MapPatch:
-    """The map in one agent's frame, near or far.
+    """Build the map in one agent's frame, near or far.
 
     Args:
         layers: [3, 100, 100], binary: driveable area, road dividers, lane dividers. Element [layer, i, j]
             shows the point (i − 10)/3 m ahead of the agent and (j − 50)/3 m to its left; of a far patch the
             point (i − 14)/1.4 m ahead and (j − 50)/1.4 m to the left.
-        encoding: as in ``scene_raster``.
+        encoding: see ``scene_raster``.
 
     Raises:
-        ValueError: layers that are not binary or not [3, 100, 100], or an unknown encoding.
+        ValueError: the layers are not binary or not [3, 100, 100], or the encoding is unknown.
     """
     array = as_layers(layers)
     if array.shape[1:] != (PATCH_PIXELS, PATCH_PIXELS):
@@ -159,37 +166,46 @@ def predict_request(
     samples: int = 0,
     seed: int | None = None,
     horizon: float | None = None,
-    blind: bool = False,
+    context: Context | None = None,
     strict: bool = False,
     history: History = "request",
     consistency: bool = False,
+    blind: bool | None = None,
 ) -> PredictRequest:
-    """A request for one scene at one time.
+    """Build a request for one scene at one time.
 
     Args:
-        time: the present, s since the epoch.
-        agents: see ``agent``.
-        scene_id: names the scene; the server remembers its agents, each by its id, and judges its forecasts
-            by what comes after them.
+        time: the present, seconds since the epoch.
+        agents: the agents, see ``agent``.
+        scene_id: name of the scene; if given, the server keeps tracks of its agents and evaluates the
+            forecasts with later observations.
         model: ``name`` or ``name@version``; empty: the server's default.
-        raster: see ``scene_raster``.
-        max_modes: return so many of the likeliest modes only; 0: all.
-        merge: return modes that a planner would not tell apart as one, their weights summed; False: all modes
-            as the model has them.
-        samples: trajectories to draw for each agent.
-        seed: of the samples; None: the server draws one and returns it.
-        horizon: s, a multiple of 0.5; None: the model's.
-        blind: forecast each agent from its own history alone, without map and neighbours.
-        strict: let any agent's fault fail the whole call.
-        history: where earlier observations come from: the request alone, or what the server remembers, too,
-            so that the request needs to hold only what is new. The latter needs a scene_id.
-        consistency: return the latest consistency of each agent. Needs a scene_id.
+        raster: map of the scene, see ``scene_raster``.
+        max_modes: max number of modes per agent, the most likely ones; 0: all.
+        merge: whether nearly equal modes are merged and their weights summed; False: the model's own modes.
+        samples: number of trajectories to sample per agent.
+        seed: seed of the samples; None: the server draws one and returns it.
+        horizon: seconds, a multiple of 0.5; None: the model's.
+        context: ``full``, or ``blind``: each agent is forecast from its own history alone, without map and
+            neighbours; None: ``full``.
+        strict: whether one invalid agent fails the whole call.
+        history: source of earlier observations: ``request``, or ``memory``: the server's tracks as well, so
+            that the request only needs new observations. ``memory`` needs a scene_id.
+        consistency: whether to return the latest consistency of each agent. Needs a scene_id.
+        blind: alias: True is ``context="blind"``, False ``context="full"``.
 
     Raises:
-        ValueError: a count or seed that is negative or beyond 32 bits, or another history.
+        ValueError: a count or seed is negative or exceeds 32 bits, context or history is unknown, or both
+            ``context`` and ``blind`` are given.
     """
     if history not in get_args(History):
         raise ValueError(f"history must be one of {', '.join(get_args(History))}, not {history!r}")
+    if blind is not None:
+        if context is not None:
+            raise ValueError("give either context or its alias blind, not both")
+        context = "blind" if blind else "full"
+    if context not in (None, *get_args(Context)):
+        raise ValueError(f"context must be one of {', '.join(get_args(Context))}, not {context!r}")
     return PredictRequest(
         time=time,
         agents=agents,
@@ -202,20 +218,20 @@ def predict_request(
             samples=samples,
             seed=seed,
             horizon=horizon,
-            context=CONTEXT_BLIND if blind else CONTEXT_FULL,
+            context=CONTEXT_BLIND if context == "blind" else CONTEXT_FULL,
             strict=strict,
-            # What is the default goes unsaid, so that servers that do not know of it understand
+            # Left out if it is the default, for servers that do not know the field.
             history=HISTORY_SOURCE_MEMORY if history == "memory" else HISTORY_SOURCE_UNSPECIFIED,
             consistency=consistency,
         ),
     )
 
 
-def _columns(what: str, values: npt.ArrayLike, count: int, fields: Sequence[str]) -> dict[str, _Floats]:
+def _columns(name: str, values: npt.ArrayLike, count: int, fields: Sequence[str]) -> dict[str, _Floats]:
     array = np.asarray(values, dtype=np.float64)
     shape = (count,) if len(fields) == 1 else (count, len(fields))
     if array.shape != shape:
-        raise ValueError(f"{what} must be {list(shape)}, but are {list(array.shape)}")
+        raise ValueError(f"{name} must be {list(shape)}, but are {list(array.shape)}")
     return dict(zip(fields, array.reshape(count, len(fields)).T, strict=True))
 
 

@@ -1,15 +1,18 @@
-"""Messages and errors as HTTP carries them: protobuf or JSON bodies, RFC 9457 problems."""
+"""HTTP codec of messages and errors: protobuf or JSON bodies, Server-Sent Events, RFC 9457 problems."""
 
+import json
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from email.utils import parsedate_to_datetime
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import httpx
 from google.protobuf import json_format
-from google.protobuf.message import DecodeError
+from google.protobuf.message import DecodeError, Message
 
+from cab.forecast.v1.routes import Request, Response, Route
+from cab_forecast.connection import Connection
 from cab_forecast.endpoints import Endpoint
 from cab_forecast.errors import (
     TOO_LARGE,
@@ -21,16 +24,19 @@ from cab_forecast.errors import (
     Unavailable,
     error_for,
 )
-from cab_forecast.methods import Method, Request, Response
-from cab_forecast.timing import Budget, StreamTimes
-from cab_forecast.transport import Connection
+from cab_forecast.timing import Budget, StreamTimeouts
 
-EVENTS = "text/event-stream"
-"""Server-Sent Events."""
+EVENT_STREAM = "text/event-stream"
+"""Media type of Server-Sent Events."""
+_Message = TypeVar("_Message", bound=Message)
+
 _MEDIA_TYPES = {"protobuf": "application/x-protobuf", "json": "application/json"}
 _PROBLEM = "application/problem+json"
 
-# For answers that do not say their code themselves: those of gateways on the way.
+_ERROR_EVENT = "error"
+"""Type of the event that ends a stream with an error."""
+
+# Codes of responses without a problem document, which come from gateways.
 _CODES = {
     400: "INVALID_ARGUMENT",
     401: "UNAUTHENTICATED",
@@ -49,105 +55,105 @@ _CODES = {
 
 
 class Codec:
-    """Messages to HTTP and back; all that the blocking and the asyncio transport share."""
+    """Conversion of messages to HTTP requests and of HTTP responses to messages, for both REST transports."""
 
     def __init__(self, connection: Connection) -> None:
         self._endpoint: Endpoint = connection.endpoint
         self._media_type = _MEDIA_TYPES[connection.encoding]
         self._headers = {"Authorization": f"Bearer {connection.token}"} if connection.token else {}
 
-    def request(self, method: Method[Request, Response], request: Request, budget: Budget) -> httpx.Request:
-        """The HTTP request, with what is left of the timeout told to the server and kept by httpx."""
+    def request(self, route: Route[Request, Response], request: Request, budget: Budget) -> httpx.Request:
+        """Return the HTTP request of a call, with the remaining time for the server and for httpx."""
         headers = {
             "Accept": f"{self._media_type}, {_PROBLEM}",
-            # Rounding must not make nothing of a little: zero is no timeout.
+            # Rounding must not give zero, which is no valid timeout.
             "Request-Timeout": f"{max(budget.remaining(), 1e-6):.6f}",
         }
         content = None
-        if method.verb == "POST":
+        if route.verb == "POST":
             headers["Content-Type"] = self._media_type
             content = self._encode(request)
-        return self._request(method, request, headers, content, budget)
+        return self._request(route, request, headers, content, budget)
 
     def stream_request(
-        self, method: Method[Request, Response], request: Request, times: StreamTimes
+        self, route: Route[Request, Response], request: Request, timeouts: StreamTimeouts
     ) -> httpx.Request:
-        """The HTTP request for a stream, which has no deadline."""
-        return self._request(method, request, {"Accept": f"{EVENTS}, {_PROBLEM}"}, None, times)
+        """Return the HTTP request of a stream, which has no deadline."""
+        return self._request(route, request, {"Accept": f"{EVENT_STREAM}, {_PROBLEM}"}, None, timeouts)
 
     def check_stream(self, response: httpx.Response) -> None:
-        """Looks at the headers of an HTTP response that is to be a stream.
+        """Check the headers of a response that must be a stream.
 
         Raises:
-            ForecastError: it is an error, the body of which was read, or nothing that such a server sends.
+            ForecastError: the response is an error (its body must have been read) or has another media type.
         """
         if not response.is_success:
             raise error_from_response(response)
-        if _media_type(response) != EVENTS:
-            raise self._unknown_type(response, EVENTS)
+        if _media_type(response) != EVENT_STREAM:
+            raise self._unknown_type(response, EVENT_STREAM)
 
-    def answer(self, method: Method[Request, Response], response: httpx.Response) -> Response:
-        """The message in an HTTP response.
+    def decode(self, route: Route[Request, Response], response: httpx.Response) -> Response:
+        """Return the message of an HTTP response.
 
         Raises:
-            ForecastError: it is an error, or nothing that a cab-forecast server sends.
+            ForecastError: the response is an error, or not from a cab-forecast server.
         """
         if not response.is_success:
             raise error_from_response(response)
         media_type = _media_type(response)
-        message = method.response()
+        message = route.response()
         try:
             if media_type == _MEDIA_TYPES["protobuf"]:
                 message.ParseFromString(response.content)
             elif media_type == _MEDIA_TYPES["json"]:
-                # A newer server may say more than this client knows of.
+                # A newer server may send fields that this client does not know.
                 json_format.Parse(response.content, message, ignore_unknown_fields=True)
             else:
                 raise self._unknown_type(response, self._media_type)
         except (DecodeError, json_format.ParseError, UnicodeDecodeError) as error:
-            raise InternalError(f"the answer of {self._endpoint.url} cannot be read: {error}") from error
+            raise InternalError(f"the response of {self._endpoint.url} cannot be parsed: {error}") from error
         return message
 
-    def lost(self, error: httpx.TransportError | TimeoutError, budget: Budget) -> ForecastError:
-        """The exception for a call that brought no HTTP response."""
+    def connection_error(self, error: httpx.TransportError | TimeoutError, budget: Budget) -> ForecastError:
+        """Return the exception for a call without an HTTP response."""
         if isinstance(error, (httpx.TimeoutException, TimeoutError)):
-            return DeadlineExceeded(f"no answer from {self._endpoint.url} within {budget.timeout:g} s")
+            return DeadlineExceeded(f"no response from {self._endpoint.url} within {budget.timeout:g} s")
         cause = str(error) or type(error).__name__
         return Unavailable(f"no connection to {self._endpoint.url}: {cause}", reason=UNREACHABLE)
 
-    def cut(self, error: httpx.TransportError, silence: float) -> ForecastError:
-        """The exception for a stream that broke off.
+    def stream_error(self, error: httpx.TransportError, idle_timeout: float) -> ForecastError:
+        """Return the exception for a stream that was interrupted.
 
         Args:
-            error: what httpx says.
-            silence: s without a byte after which it gave up.
+            error: the error of httpx.
+            idle_timeout: seconds without a byte after which it gave up.
         """
         if isinstance(error, httpx.TimeoutException):
-            cause = f"no word from it for {silence:g} s"
+            cause = f"no data for {idle_timeout:g} s"
         else:
             cause = str(error) or type(error).__name__
         return Unavailable(f"lost the connection to {self._endpoint.url}: {cause}", reason=UNREACHABLE)
 
     def _request(
         self,
-        method: Method[Request, Response],
+        route: Route[Request, Response],
         request: Request,
         headers: dict[str, str],
         content: bytes | None,
-        times: Mapping[str, float],
+        timeouts: Mapping[str, float],
     ) -> httpx.Request:
         return httpx.Request(
-            method.verb,
-            self._endpoint.target + method.path(request),
+            route.verb,
+            self._endpoint.target + route.target(request),
             headers=self._headers | headers,
             content=content,
-            extensions={"timeout": times},
+            extensions={"timeout": timeouts},
         )
 
-    def _unknown_type(self, response: httpx.Response, wanted: str) -> InternalError:
+    def _unknown_type(self, response: httpx.Response, expected: str) -> InternalError:
         return InternalError(
-            f"{self._endpoint.url} answered with {_media_type(response) or 'no media type'} instead of "
-            f"{wanted}; is it a cab-forecast server?"
+            f"{self._endpoint.url} responded with {_media_type(response) or 'no media type'} instead of "
+            f"{expected}; is it a cab-forecast server?"
         )
 
     def _encode(self, request: Request) -> bytes:
@@ -156,11 +162,58 @@ class Codec:
         return request.SerializeToString()
 
 
+class EventReader(Generic[_Message]):
+    """Incremental parser of Server-Sent Events."""
+
+    def __init__(self, message_type: type[_Message]) -> None:
+        self._message_type = message_type
+        self._buffer = b""
+        self._kind = ""
+        self._data: list[str] = []
+
+    def feed(self, chunk: bytes) -> Iterator[_Message]:
+        """Yield the messages that the next chunk of the body completes.
+
+        Empty messages are dropped: they only say that the stream has started, as the headers did.
+
+        Raises:
+            ForecastError: the server reports an error, or an event cannot be parsed.
+        """
+        # Split at "\n" only: an id may contain other line separators that str.splitlines knows.
+        *lines, self._buffer = (self._buffer + chunk).split(b"\n")
+        for line in lines:
+            name, _, value = line.removesuffix(b"\r").decode(errors="replace").partition(":")
+            if name == "data":
+                self._data.append(value.removeprefix(" "))
+            elif name == "event":
+                self._kind = value.strip()
+            elif not line.strip():
+                message = self._message()
+                if message.ByteSize():
+                    yield message
+
+    def _message(self) -> _Message:
+        data, kind = "\n".join(self._data), self._kind
+        self._data, self._kind = [], ""
+        try:
+            if not data:
+                return self._message_type()
+            if kind == _ERROR_EVENT:
+                problem = json.loads(data)
+                raise error_from_problem(
+                    problem if isinstance(problem, dict) else {}, message="the stream failed"
+                )
+            # A newer server may send fields that this client does not know.
+            return json_format.Parse(data, self._message_type(), ignore_unknown_fields=True)
+        except (json_format.ParseError, ValueError) as error:
+            raise InternalError(f"an event cannot be parsed: {error}") from error
+
+
 def error_from_response(response: httpx.Response) -> ForecastError:
-    """The exception for an HTTP response that is not a success.
+    """Return the exception for an HTTP response that is not a success.
 
     Args:
-        response: problem+json from the server, or anything from a gateway on the way.
+        response: problem+json from the server, or anything from a gateway.
     """
     return error_from_problem(
         _problem(response),
@@ -179,14 +232,14 @@ def error_from_problem(
     reason: str = "",
     retry_after: float | None = None,
 ) -> ForecastError:
-    """The exception for a problem document.
+    """Return the exception for a problem document.
 
     Args:
-        problem: what the server says; may lack anything.
-        code: canonical status code, where the problem does not say it.
-        message: what happened, likewise.
-        reason: likewise.
-        retry_after: s.
+        problem: the problem document; any part may be missing.
+        code: canonical status code if the problem has none.
+        message: message if the problem has none.
+        reason: reason if the problem has none.
+        retry_after: seconds; None: the server did not say.
     """
     errors = problem.get("errors")
     return error_for(
@@ -218,7 +271,7 @@ def _media_type(response: httpx.Response) -> str:
 
 
 def _retry_after(value: str | None) -> float | None:
-    """s, from seconds or from an HTTP date (RFC 9110, section 10.2.3); None where it says neither."""
+    """Return the seconds of a Retry-After header, which holds seconds or an HTTP date (RFC 9110, 10.2.3)."""
     if value is None:
         return None
     try:

@@ -1,4 +1,4 @@
-"""Calls over REST."""
+"""REST transports: a blocking one, and one for asyncio."""
 
 import asyncio
 import socket
@@ -8,27 +8,26 @@ from contextlib import suppress
 
 import httpx
 
-from cab_forecast.events import EventReader
-from cab_forecast.methods import Method, Request, Response
-from cab_forecast.rest_codec import Codec
-from cab_forecast.streams import Opened, Stream
-from cab_forecast.timing import Budget, StreamTimes
-from cab_forecast.transport import Connection
+from cab.forecast.v1.routes import Request, Response, Route
+from cab_forecast.connection import Connection
+from cab_forecast.rest_codec import Codec, EventReader
+from cab_forecast.streams import OpenStream, Stream
+from cab_forecast.timing import Budget, StreamTimeouts
 
-SILENCE = 45.0
-"""s without a byte after which a stream is taken for lost: three of the server's heartbeats."""
+IDLE_TIMEOUT = 45.0
+"""Seconds without a byte after which a stream counts as lost: three heartbeats of the server."""
 
 
 class RestTransport:
-    """Blocking calls over a pool of connections; usable from several threads."""
+    """Blocking transport over a pool of connections; usable from several threads."""
 
     def __init__(self, connection: Connection) -> None:
         self._codec = Codec(connection)
         self._client = httpx.Client(verify=_verify(connection))
 
-    def call(self, method: Method[Request, Response], request: Request, budget: Budget) -> Response:
-        """As ``Transport.call``."""
-        sent = self._codec.request(method, request, budget)
+    def call(self, route: Route[Request, Response], request: Request, budget: Budget) -> Response:
+        """See ``Transport.call``."""
+        sent = self._codec.request(route, request, budget)
         try:
             response = self._client.send(sent, stream=True)
             try:
@@ -36,13 +35,13 @@ class RestTransport:
             finally:
                 response.close()
         except httpx.TransportError as error:
-            raise self._codec.lost(error, budget) from error
-        return self._codec.answer(method, complete)
+            raise self._codec.connection_error(error, budget) from error
+        return self._codec.decode(route, complete)
 
-    def open(self, method: Method[Request, Response], request: Request, budget: Budget) -> Stream[Response]:
-        """As ``Transport.open``."""
-        times = StreamTimes(budget, SILENCE)
-        sent = self._codec.stream_request(method, request, times)
+    def open(self, route: Route[Request, Response], request: Request, budget: Budget) -> Stream[Response]:
+        """See ``Transport.open``."""
+        timeouts = StreamTimeouts(budget, IDLE_TIMEOUT)
+        sent = self._codec.stream_request(route, request, timeouts)
         try:
             response = self._client.send(sent, stream=True)
             try:
@@ -53,47 +52,47 @@ class RestTransport:
                 response.close()
                 raise
         except httpx.TransportError as error:
-            raise self._codec.lost(error, budget) from error
-        times.begun = True
-        return Stream(self._messages(response, method), lambda: _hang_up(response))
+            raise self._codec.connection_error(error, budget) from error
+        timeouts.started = True
+        return Stream(self._messages(response, route), lambda: _shut_down(response))
 
     def close(self) -> None:
-        """As ``Transport.close``."""
+        """See ``Transport.close``."""
         self._client.close()
 
-    def _messages(self, response: httpx.Response, method: Method[Request, Response]) -> Iterator[Response]:
-        reader = EventReader(method.response)
+    def _messages(self, response: httpx.Response, route: Route[Request, Response]) -> Iterator[Response]:
+        reader = EventReader(route.response)
         try:
             for chunk in response.iter_bytes():
                 yield from reader.feed(chunk)
         except httpx.TransportError as error:
-            raise self._codec.cut(error, SILENCE) from error
+            raise self._codec.stream_error(error, IDLE_TIMEOUT) from error
 
 
 class AsyncRestTransport:
-    """Calls over a pool of connections, for asyncio."""
+    """Transport over a pool of connections, for asyncio."""
 
     def __init__(self, connection: Connection) -> None:
         self._codec = Codec(connection)
         self._client = httpx.AsyncClient(verify=_verify(connection))
 
-    async def call(self, method: Method[Request, Response], request: Request, budget: Budget) -> Response:
-        """As ``AsyncTransport.call``."""
-        sent = self._codec.request(method, request, budget)
+    async def call(self, route: Route[Request, Response], request: Request, budget: Budget) -> Response:
+        """See ``AsyncTransport.call``."""
+        sent = self._codec.request(route, request, budget)
         try:
-            # httpx bounds each read by itself: a body that trickles would never be late
+            # httpx bounds each read separately: a body that trickles in would never time out.
             async with asyncio.timeout(budget.remaining()):
                 response = await self._client.send(sent)
         except (httpx.TransportError, TimeoutError) as error:
-            raise self._codec.lost(error, budget) from error
-        return self._codec.answer(method, response)
+            raise self._codec.connection_error(error, budget) from error
+        return self._codec.decode(route, response)
 
     async def open(
-        self, method: Method[Request, Response], request: Request, budget: Budget
-    ) -> Opened[Response]:
-        """As ``AsyncTransport.open``."""
-        times = StreamTimes(budget, SILENCE)
-        sent = self._codec.stream_request(method, request, times)
+        self, route: Route[Request, Response], request: Request, budget: Budget
+    ) -> OpenStream[Response]:
+        """See ``AsyncTransport.open``."""
+        timeouts = StreamTimeouts(budget, IDLE_TIMEOUT)
+        sent = self._codec.stream_request(route, request, timeouts)
         try:
             async with asyncio.timeout(budget.remaining()):
                 response = await self._client.send(sent, stream=True)
@@ -105,31 +104,31 @@ class AsyncRestTransport:
                     await response.aclose()
                     raise
         except (httpx.TransportError, TimeoutError) as error:
-            raise self._codec.lost(error, budget) from error
-        times.begun = True
-        return Opened(self._messages(response, method), response.aclose)
+            raise self._codec.connection_error(error, budget) from error
+        timeouts.started = True
+        return OpenStream(self._messages(response, route), response.aclose)
 
     async def close(self) -> None:
-        """As ``AsyncTransport.close``."""
+        """See ``AsyncTransport.close``."""
         await self._client.aclose()
 
     async def _messages(
-        self, response: httpx.Response, method: Method[Request, Response]
+        self, response: httpx.Response, route: Route[Request, Response]
     ) -> AsyncGenerator[Response]:
-        reader = EventReader(method.response)
+        reader = EventReader(route.response)
         try:
             async for chunk in response.aiter_bytes():
                 for message in reader.feed(chunk):
                     yield message
         except httpx.TransportError as error:
-            raise self._codec.cut(error, SILENCE) from error
+            raise self._codec.stream_error(error, IDLE_TIMEOUT) from error
 
 
 def _read(response: httpx.Response, budget: Budget) -> httpx.Response:
-    """A streamed response with its body.
+    """Read the body of a streamed response.
 
-    httpx bounds each read of a body by what was left when the body began, so that one which trickles would
-    never be late. Here the clock is looked at after each read: the last one may overrun, no more.
+    httpx bounds each read by the time that remained when the body began, so that a body that trickles in
+    would never time out. Here the budget is checked after each read; only the last read may overrun it.
 
     Raises:
         DeadlineExceeded: the body took too long.
@@ -143,12 +142,12 @@ def _read(response: httpx.Response, budget: Budget) -> httpx.Response:
     )
 
 
-def _hang_up(response: httpx.Response) -> None:
-    """Ends a response; a thread that waits for more of it finds the end."""
+def _shut_down(response: httpx.Response) -> None:
+    """Close a response; a thread that reads from it finds the end."""
     stream = response.extensions.get("network_stream")
     connection = stream.get_extra_info("socket") if stream is not None else None
     if connection is not None:
-        # To close a socket does not wake who reads from it
+        # Closing a socket does not wake a thread that reads from it; shutting it down does.
         with suppress(OSError):
             connection.shutdown(socket.SHUT_RDWR)
     response.close()

@@ -1,4 +1,4 @@
-"""Answers that go on: iterators that end their call when they are closed."""
+"""Streamed responses: iterators over the messages of a call, which end the call when they are closed."""
 
 import asyncio
 from collections.abc import AsyncGenerator, Awaitable, Callable, Iterator
@@ -15,24 +15,27 @@ _Message = TypeVar("_Message", bound=Message)
 
 
 class Stream(Iterator[_Message]):
-    """The messages of a call that has begun, as they come. Ends when the server ends it; close it (``with``
-    does), or it goes on for as long as the client is open."""
+    """Messages of a started call, as they arrive.
 
-    def __init__(self, messages: Iterator[_Message], hang_up: Callable[[], None]) -> None:
+    The stream ends when the server ends it. Otherwise close it (``with`` does), or it stays open as long as
+    the client.
+    """
+
+    def __init__(self, messages: Iterator[_Message], cancel: Callable[[], None]) -> None:
         """
         Args:
-            messages: waits for the next one; raises ForecastError where there is none.
-            hang_up: ends the call; from any thread, any number of times.
+            messages: blocks until the next message; raises ForecastError if the call fails.
+            cancel: ends the call; may be called from any thread and repeatedly.
         """
         self._messages = messages
-        self._hang_up = hang_up
+        self._cancel = cancel
         self._closed = False
 
     def __next__(self) -> _Message:
-        """The next message.
+        """Return the next message.
 
         Raises:
-            ForecastError: the call failed; its subclass says why.
+            ForecastError: the call failed; the subclass says why.
         """
         if self._closed:
             raise StopIteration
@@ -48,9 +51,9 @@ class Stream(Iterator[_Message]):
             raise
 
     def close(self) -> None:
-        """Ends the call; another thread that waits for the next message finds the end."""
+        """End the call. In another thread that waits for a message, the iteration ends."""
         self._closed = True
-        self._hang_up()
+        self._cancel()
 
     def __enter__(self) -> Self:
         return self
@@ -62,36 +65,39 @@ class Stream(Iterator[_Message]):
 
 
 @dataclass(frozen=True)
-class Opened(Generic[_Message]):
-    """A call that has begun."""
+class OpenStream(Generic[_Message]):
+    """A started call of an asyncio transport."""
 
     messages: AsyncGenerator[_Message]
-    """Waits for the next one; raises ForecastError where there is none."""
-    hang_up: Callable[[], Awaitable[object]]
-    """Ends the call, any number of times."""
+    """Waits for the next message; raises ForecastError if the call fails."""
+    cancel: Callable[[], Awaitable[object]]
+    """Ends the call; may be called repeatedly."""
 
 
 class AsyncStream(Generic[_Message]):
-    """``Stream`` for asyncio. The call begins with ``async with``, or with the first message asked for; it
-    ends with a task that is cancelled while it waits for a message."""
+    """``Stream`` for asyncio.
 
-    def __init__(self, begin: Callable[[], Awaitable[Opened[_Message]]]) -> None:
+    The call starts with ``async with`` or with the first message. It ends, too, if the task that waits for a
+    message is cancelled.
+    """
+
+    def __init__(self, start: Callable[[], Awaitable[OpenStream[_Message]]]) -> None:
         """
         Args:
-            begin: the call; raises ForecastError where it does not.
+            start: starts the call; raises ForecastError if that fails.
         """
-        self._begin = begin
-        self._opened: Opened[_Message] | None = None
+        self._start = start
+        self._opened: OpenStream[_Message] | None = None
         self._closed = False
 
     def __aiter__(self) -> Self:
         return self
 
     async def __anext__(self) -> _Message:
-        """The next message.
+        """Return the next message.
 
         Raises:
-            ForecastError: the call failed; its subclass says why.
+            ForecastError: the call failed; the subclass says why.
         """
         if self._closed:
             raise StopAsyncIteration
@@ -104,7 +110,7 @@ class AsyncStream(Generic[_Message]):
         except asyncio.CancelledError:
             closed = self._closed
             await self.aclose()
-            # gRPC raises it where its call was ended, too: by us, or with the client
+            # gRPC also raises this when its call was ended, by this stream or with the client.
             if _is_cancelled():
                 raise
             if closed:
@@ -117,12 +123,12 @@ class AsyncStream(Generic[_Message]):
             raise
 
     async def aclose(self) -> None:
-        """Ends the call; another task that waits for the next message finds the end."""
+        """End the call. In another task that waits for a message, the iteration ends."""
         self._closed = True
         opened, self._opened = self._opened, None
         if opened is not None:
-            await opened.hang_up()
-            with suppress(RuntimeError):  # another task is still in it, and finds the end by itself
+            await opened.cancel()
+            with suppress(RuntimeError):  # another task is inside the generator, and will end it
                 await opened.messages.aclose()
 
     async def __aenter__(self) -> Self:
@@ -134,11 +140,11 @@ class AsyncStream(Generic[_Message]):
     ) -> None:
         await self.aclose()
 
-    async def _open(self) -> Opened[_Message]:
+    async def _open(self) -> OpenStream[_Message]:
         if self._opened is None:
-            opened = await self._begin()
-            if self._closed:  # by another task meanwhile
-                await opened.hang_up()
+            opened = await self._start()
+            if self._closed:  # by another task in the meantime
+                await opened.cancel()
                 raise StopAsyncIteration
             self._opened = opened
         return self._opened

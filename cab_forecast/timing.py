@@ -1,4 +1,4 @@
-"""The time a call may take, and the pauses between its attempts."""
+"""Time budget of a call, and the retry policy that draws on it."""
 
 import math
 import time
@@ -10,23 +10,23 @@ from tenacity.wait import wait_base, wait_exponential_jitter, wait_random
 
 from cab_forecast.errors import DeadlineExceeded, ForecastError
 
-_FIRST_PAUSE = 0.05
-_LONGEST_PAUSE = 2.0
+_MIN_BACKOFF = 0.05
+_MAX_BACKOFF = 2.0
 
 
 class Budget(Mapping[str, float]):
-    """What is left of a call's timeout; retries and the phases of an attempt all draw on it.
+    """Remaining time of a call, shared by its retries and by the phases of each attempt.
 
-    As a mapping every key holds the seconds left at the moment it is looked up. That is what makes
-    httpx's "timeout" extension (connect, write, read, pool) bound the sum of its phases: given plain
-    numbers it would grant each phase the whole timeout.
+    As a mapping, every key holds the seconds that remain at the moment of the look-up. httpx reads its
+    "timeout" extension (connect, write, read, pool) this way, so that the sum of the phases is bounded. With
+    plain numbers each phase would be granted the whole timeout.
     """
 
     def __init__(self, timeout: float) -> None:
-        """Starts the clock.
+        """Start the clock.
 
         Args:
-            timeout: s.
+            timeout: seconds.
 
         Raises:
             ValueError: the timeout is not a positive, finite number.
@@ -37,10 +37,10 @@ class Budget(Mapping[str, float]):
         self._end = time.monotonic() + timeout
 
     def remaining(self) -> float:
-        """s.
+        """Return the remaining seconds.
 
         Raises:
-            DeadlineExceeded: nothing is left.
+            DeadlineExceeded: none remain.
         """
         left = self._end - time.monotonic()
         if left <= 0:
@@ -48,8 +48,8 @@ class Budget(Mapping[str, float]):
         return left
 
     def exceeded(self) -> DeadlineExceeded:
-        """The error for a call that took longer."""
-        return DeadlineExceeded(f"no answer within {self.timeout:g} s")
+        """Return the error for a call that took longer."""
+        return DeadlineExceeded(f"no response within {self.timeout:g} s")
 
     def __getitem__(self, phase: str) -> float:
         return self.remaining()
@@ -61,21 +61,21 @@ class Budget(Mapping[str, float]):
         return 4
 
 
-class StreamTimes(Mapping[str, float]):
-    """What httpx may wait for a stream: the budget until it has begun, from then on so long for each read."""
+class StreamTimeouts(Mapping[str, float]):
+    """httpx timeouts of a stream: the budget until it has started, then a fixed timeout for each read."""
 
-    def __init__(self, budget: Budget, silence: float) -> None:
+    def __init__(self, budget: Budget, idle_timeout: float) -> None:
         """
         Args:
-            budget: of beginning.
-            silence: s without a byte from the server after which the connection is taken for lost.
+            budget: the time for the start of the stream.
+            idle_timeout: seconds without a byte after which the connection counts as lost.
         """
         self._budget = budget
-        self._silence = silence
-        self.begun = False
+        self._idle_timeout = idle_timeout
+        self.started = False
 
     def __getitem__(self, phase: str) -> float:
-        return self._silence if self.begun else self._budget[phase]
+        return self._idle_timeout if self.started else self._budget[phase]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._budget)
@@ -84,33 +84,34 @@ class StreamTimes(Mapping[str, float]):
         return len(self._budget)
 
 
-class _WaitAsTold(wait_base):
-    """Waits as long as the server asked for, and a little at random so that clients do not return as one;
-    without its word an exponential back-off with jitter."""
+class _Backoff(wait_base):
+    """Wait for the server's retry-after plus jitter; without one, exponential backoff with jitter."""
 
     def __init__(self) -> None:
-        self._own = wait_exponential_jitter(multiplier=_FIRST_PAUSE, max=_LONGEST_PAUSE, jitter=_FIRST_PAUSE)
-        self._spread = wait_random(0, _FIRST_PAUSE)
+        self._exponential = wait_exponential_jitter(
+            multiplier=_MIN_BACKOFF, max=_MAX_BACKOFF, jitter=_MIN_BACKOFF
+        )
+        self._jitter = wait_random(0, _MIN_BACKOFF)
 
     def __call__(self, retry_state: RetryCallState) -> float:
         error = retry_state.outcome.exception() if retry_state.outcome else None
         if isinstance(error, ForecastError) and error.retry_after is not None:
-            return error.retry_after + self._spread(retry_state)
-        return self._own(retry_state)
+            return error.retry_after + self._jitter(retry_state)
+        return self._exponential(retry_state)
 
 
 class _RetryIfRetryable(retry_base):
-    """Retries what may succeed in a moment: overload, a draining server, a lost connection."""
+    """Retry of transient errors: overload, a draining server, a lost connection."""
 
     def __call__(self, retry_state: RetryCallState) -> bool:
         error = retry_state.outcome.exception() if retry_state.outcome else None
         return isinstance(error, ForecastError) and error.retryable
 
 
-WAIT: wait_base = _WaitAsTold()
+WAIT: wait_base = _Backoff()
 RETRY: retry_base = _RetryIfRetryable()
 
 
-def stop(retries: int, budget: Budget) -> stop_base:
-    """Ends the retries after so many, or earlier when the next pause would outlast the budget."""
+def stop_condition(retries: int, budget: Budget) -> stop_base:
+    """Return the condition that ends the retries: their number, or a wait that would outlast the budget."""
     return stop_after_attempt(retries + 1) | stop_before_delay(budget.timeout)

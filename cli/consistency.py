@@ -31,7 +31,7 @@ def models(
 ) -> None:
     """Show each model's metrics since the server started."""
     from cab.forecast.v1.consistency_service_pb2 import ListModelConsistencyResponse
-    from cab_forecast.show_consistency import print_models
+    from cab_forecast.show import print_models
     from cli.messages import to_json
 
     with connect(Connection(endpoint, token, timeout)) as client:
@@ -51,7 +51,7 @@ def scene(
     as_json: AsJson = False,
 ) -> None:
     """Show the latest observation of every agent of a scene, and sums by model."""
-    from cab_forecast.show_consistency import print_scene
+    from cab_forecast.show import print_scene
     from cli.messages import to_json
 
     with connect(Connection(endpoint, token, timeout)) as client:
@@ -76,7 +76,7 @@ def agent(
 ) -> None:
     """Show an agent's latest observations, and what was forecast for them."""
     from cab.forecast.v1.consistency_service_pb2 import GetAgentConsistencyResponse
-    from cab_forecast.show_consistency import print_instants
+    from cab_forecast.show import print_instants
     from cli.messages import to_json
 
     with connect(Connection(endpoint, token, timeout)) as client:
@@ -96,7 +96,7 @@ def watch(
     as_json: AsJson = False,
 ) -> None:
     """Print a scene's metrics as they are settled, until Ctrl-C or until the server ends the stream."""
-    from cab_forecast.show_consistency import print_event
+    from cab_forecast.show import print_event
     from cli.messages import to_json
 
     connection = Connection(endpoint, token, timeout)

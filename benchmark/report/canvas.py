@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from cab_forecast.plot_style import INK
+from cab_forecast.plot import INK
 
 DOTS_PER_INCH = 110
 _PADDING = 0.1

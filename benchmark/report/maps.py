@@ -10,8 +10,7 @@ from benchmark.hard_cases import CaseForecast, HardCase
 from benchmark.report.canvas import FRAME, Style, grid, plain
 from benchmark.requests import crop
 from cab.forecast.v1.prediction_service_pb2 import PredictRequest
-from cab_forecast.plot_map import draw_map
-from cab_forecast.plot_style import GROUND, INK
+from cab_forecast.plot import GROUND, INK, draw_map
 from model.arrays import Floats
 
 _PANELS_A_ROW = 5

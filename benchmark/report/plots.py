@@ -11,7 +11,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from benchmark.report.canvas import REFERENCE, Style, dress, empty, grid, plain, styles
 from benchmark.results import BenchmarkModelResult, BenchmarkResults
-from cab_forecast.plot_style import INK
+from cab_forecast.plot import INK
 from model.arrays import Floats
 from model.evaluation.published import published_figures
 from model.forecaster import Protocol

@@ -1,6 +1,6 @@
-"""A made-up scene to try a server with: traffic at a crossing of two roads.
+"""Synthetic demo scene: traffic at a crossing of two roads.
 
-Everything is computed here, the same at every call; there is no data to load and none to license.
+The scene is computed and deterministic; there is no data to load or to license.
 """
 
 from cab.forecast.v1.prediction_service_pb2 import PredictRequest
@@ -12,9 +12,9 @@ __all__ = ["demo_request"]
 
 
 def demo_request(time: float = NOW) -> PredictRequest:
-    """A request with eleven agents at a four-way crossing, and its map.
+    """Build a request with eleven agents at a four-way crossing, and its map.
 
     Args:
-        time: the present, s since the epoch; the histories end there.
+        time: the present, seconds since the epoch, at which the histories end.
     """
     return predict_request(time, traffic(time), scene_id="demo", raster=crossing_raster())

@@ -1,4 +1,4 @@
-"""Prints the demo request as JSON: ``python -m cab_forecast.demo > demo.json``."""
+"""Command that prints the demo request as JSON: ``python -m cab_forecast.demo > demo.json``."""
 
 import sys
 

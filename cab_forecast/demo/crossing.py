@@ -1,4 +1,4 @@
-"""The demo's map: two roads of two lanes each way, traffic on the right; one lay-by."""
+"""Map of the demo scene: two roads with two lanes each way, right-hand traffic, and one lay-by."""
 
 import numpy as np
 import numpy.typing as npt
@@ -7,16 +7,16 @@ from cab.forecast.v1.prediction_service_pb2 import SceneRaster
 from cab_forecast.requests import PIXELS_PER_METER, scene_raster
 
 LANE_WIDTH = 3.5
-"""m."""
+"""Metres."""
 ROAD_HALF_WIDTH = 2 * LANE_WIDTH
 CORNER_RADIUS = 6.0
-"""m, of the kerb's rounding."""
+"""Radius of the rounded kerb, m."""
 STOP_LINE = ROAD_HALF_WIDTH + CORNER_RADIUS + 1.5
-"""m from the centre; painted lines end here."""
+"""Distance from the centre at which painted lines end, m."""
 LAY_BY_CENTER = (34.0, -ROAD_HALF_WIDTH - 1.25)
 """Ground position, m, south of the eastern arm."""
 EDGE = 60.0
-"""m from the centre to the raster's edges."""
+"""Distance from the centre to the edges of the raster, m."""
 
 _LAY_BY_SIZE = (22.0, 2.5)
 _ROAD_DIVIDER_WIDTH = 0.7
@@ -27,7 +27,7 @@ _Bools = npt.NDArray[np.bool_]
 
 
 def crossing_raster() -> SceneRaster:
-    """The crossing, centred on the ground frame's origin; roads run along x and along y."""
+    """Build the map, centred on the origin of the ground frame; the roads run along x and y."""
     pixels = round(2 * EDGE * PIXELS_PER_METER)
     ground = -EDGE + np.arange(pixels) / PIXELS_PER_METER
     x, y = np.meshgrid(ground, ground, indexing="ij")
@@ -36,7 +36,7 @@ def crossing_raster() -> SceneRaster:
 
 
 def driveable(x: _Floats, y: _Floats) -> _Bools:
-    """Whether ground points belong to the roads; any shape, m."""
+    """Return which ground points belong to the roads; any shape, m."""
     across_x, across_y = np.abs(y), np.abs(x)
     roads = (across_x <= ROAD_HALF_WIDTH) | (across_y <= ROAD_HALF_WIDTH)
     corner = ROAD_HALF_WIDTH + CORNER_RADIUS
@@ -52,7 +52,7 @@ def _lane_dividers(x: _Floats, y: _Floats) -> _Bools:
 
 
 def _lines(x: _Floats, y: _Floats, offset: float, width: float) -> _Bools:
-    """Lines along all four arms, so far from their middle; the crossing itself is without paint."""
+    """Return lines along all four arms, at an offset from their middle; the crossing itself has none."""
     along_x = (np.abs(y - offset) <= width / 2) & (np.abs(x) >= STOP_LINE)
     along_y = (np.abs(x - offset) <= width / 2) & (np.abs(y) >= STOP_LINE)
     return np.asarray(along_x | along_y)

@@ -1,4 +1,4 @@
-"""Motion along a path: lines and arcs, driven through with constant acceleration."""
+"""Motion with constant acceleration along a path of lines and arcs."""
 
 import math
 from collections.abc import Sequence
@@ -11,28 +11,28 @@ Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Piece:
-    """A stretch of constant curvature."""
+class Segment:
+    """A segment of constant curvature."""
 
     length: float
-    """m."""
+    """Metres."""
     curvature: float = 0.0
     """1/m, positive to the left; 0: straight."""
 
 
 @dataclass(frozen=True)
 class Path:
-    """A line to move along, without kinks; before its start and after its end it goes straight on."""
+    """A smooth path of segments, extended by straight lines before its start and after its end."""
 
     x: float
-    """Where it starts, m."""
+    """Start position, m."""
     y: float
     heading: float
-    """Where it leads there, rad."""
-    pieces: Sequence[Piece] = ()
+    """Heading at the start, rad."""
+    segments: Sequence[Segment] = ()
 
     def poses(self, distances: Floats) -> Floats:
-        """Where one is after so many metres.
+        """Return the poses at distances along the path.
 
         Args:
             distances: [F], m from the start; negative: before it.
@@ -44,32 +44,32 @@ class Path:
 
     def _pose(self, distance: float) -> tuple[float, float, float]:
         pose = (self.x, self.y, self.heading)
-        for piece in self.pieces:
+        for segment in self.segments:
             if distance <= 0.0:
                 break
-            covered = min(distance, piece.length)
-            pose = _advance(pose, covered, piece.curvature)
+            covered = min(distance, segment.length)
+            pose = _advance(pose, covered, segment.curvature)
             distance -= covered
         return _advance(pose, distance, 0.0)
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Speed up to now: constant acceleration, but never backwards."""
+    """Motion along a path up to the present, with constant acceleration and without reversing."""
 
     path: Path
     distance: float
-    """How far along the path one is now, m."""
+    """Current distance along the path, m."""
     speed: float
-    """Now, m/s, at least 0."""
+    """Current speed, m/s, at least 0."""
     acceleration: float = 0.0
-    """m/s², held all the time."""
+    """Constant acceleration, m/s²."""
 
     def history(self, times: Floats) -> tuple[Floats, Floats]:
-        """What was observed.
+        """Return the observations of the motion.
 
         Args:
-            times: [F], s from now, none positive.
+            times: [F], seconds from the present, none positive.
 
         Returns:
             [F, 3] poses (x, y, heading) and [F, 2] velocities in m/s.
@@ -79,7 +79,7 @@ class Motion:
         """
         speeds = self.speed + self.acceleration * times
         if (speeds < 0).any():
-            raise ValueError("no one drives backwards here")
+            raise ValueError("the speed would have been negative")
         distances = self.distance + self.speed * times + self.acceleration * times**2 / 2
         poses = self.path.poses(distances)
         directions = np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=-1)

@@ -288,9 +288,9 @@ def test_retry_after_may_be_a_date_or_nonsense(script: Script, value: str, secon
     ("body", "media_type", "match"),
     [
         (b"<html>hello</html>", "text/html", "is it a cab-forecast server"),
-        (b"\xff\xff\xff", "application/x-protobuf", "cannot be read"),
-        (b"{]", "application/json", "cannot be read"),
-        (b"\xff", "application/json", "cannot be read"),
+        (b"\xff\xff\xff", "application/x-protobuf", "cannot be parsed"),
+        (b"{]", "application/json", "cannot be parsed"),
+        (b"\xff", "application/json", "cannot be parsed"),
     ],
 )
 def test_answers_that_are_none(

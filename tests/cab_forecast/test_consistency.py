@@ -257,11 +257,11 @@ def test_nobody_there_to_watch(scheme: str) -> None:
 
 @pytest.mark.parametrize(
     ("drip", "match"),
-    [(None, "lost the connection"), (b"", r"no word from it for 0\.3 s")],
+    [(None, "lost the connection"), (b"", r"no data for 0\.3 s")],
     ids=["broken", "silent"],
 )
 def test_a_watch_that_breaks_off(monkeypatch: pytest.MonkeyPatch, drip: bytes | None, match: str) -> None:
-    monkeypatch.setattr("cab_forecast.rest_transport.SILENCE", 0.3)
+    monkeypatch.setattr("cab_forecast.rest_transport.IDLE_TIMEOUT", 0.3)
     head = SSE_HEAD + b'15\r\ndata: {"missed": 1}\n\n\r\n'
     with raw_server(head, drip) as address, Client(f"http://{address}") as client:
         events = client.watch_scene("s", timeout=5)

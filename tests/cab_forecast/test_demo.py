@@ -11,7 +11,7 @@ from google.protobuf import json_format
 from cab.forecast.v1.prediction_service_pb2 import Agent, PredictRequest
 from cab_forecast import demo_request
 from cab_forecast.demo.crossing import driveable
-from cab_forecast.demo.paths import Motion, Path, Piece
+from cab_forecast.demo.paths import Motion, Path, Segment
 from cab_forecast.layers import decode_layers
 
 AGENTS = list(demo_request().agents)
@@ -93,7 +93,7 @@ def test_the_turn_is_one() -> None:
 
 
 def test_paths_have_no_kinks() -> None:
-    path = Path(1.0, 2.0, 0.3, [Piece(2.0), Piece(3.0, 0.4), Piece(1.0, -0.2)])
+    path = Path(1.0, 2.0, 0.3, [Segment(2.0), Segment(3.0, 0.4), Segment(1.0, -0.2)])
     poses = path.poses(np.arange(-1.0, 8.0, 0.01))
     assert np.hypot(*np.diff(poses[:, :2], axis=0).T) == pytest.approx(0.01, rel=1e-4)
     assert np.abs(np.diff(poses[:, 2])).max() <= 0.4 * 0.01 + 1e-12
@@ -101,7 +101,7 @@ def test_paths_have_no_kinks() -> None:
 
 
 def test_no_one_drives_backwards() -> None:
-    with pytest.raises(ValueError, match="backwards"):
+    with pytest.raises(ValueError, match="would have been negative"):
         Motion(Path(0, 0, 0), 0.0, 1.0, 1.0).history(np.array([-2.0, 0.0]))
 
 

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from cab.forecast.v1.consistency_service_pb2 import InstantConsistency, WatchSceneResponse
 from cab_forecast import BadRequest, ForecastError, InternalError
-from cab_forecast.events import EventReader
+from cab_forecast.rest_codec import EventReader
 
 BODY = (
     ': heartbeat\n\nevent: error\n\ndata: {"missed": "1"}\n\n'
@@ -31,7 +31,7 @@ def test_messages_come_in_any_pieces(cuts: list[int]) -> None:
 
 @pytest.mark.parametrize("data", ["{", "7", "soon", '{"missed": "many"}'])
 def test_what_cannot_be_read(data: str) -> None:
-    with pytest.raises(InternalError, match="cannot be read"):
+    with pytest.raises(InternalError, match="cannot be parsed"):
         list(EventReader(WatchSceneResponse).feed(f"data: {data}\n\n".encode()))
 
 
@@ -39,5 +39,5 @@ def test_errors() -> None:
     problem = '{"code": "INVALID_ARGUMENT", "detail": "no", "errors": [{"field": "f", "detail": "d"}]}'
     with pytest.raises(BadRequest, match="no; f: d"):
         list(EventReader(WatchSceneResponse).feed(f"event: error\ndata: {problem}\n\n".encode()))
-    with pytest.raises(ForecastError, match="it failed"):
+    with pytest.raises(ForecastError, match="the stream failed"):
         list(EventReader(WatchSceneResponse).feed(b"event: error\ndata: []\n\n"))

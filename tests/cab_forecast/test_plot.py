@@ -40,8 +40,8 @@ def test_draws_odd_scenes(tmp_path: Path) -> None:
     """Far agents, standing ones, invalid ones, patches of their own, no map, many of them."""
     patch = map_patch(np.ones((3, 100, 100)))
     odd = [
-        agent("still", "vehicle", [-0.5, 0.0], [[5, 5], [5, 5]], patch=patch),
-        agent("own-map", "vehicle", [-0.5, 0.0], [[0, 0], [1, 1]], headings=[0.7, 0.7], patch=patch),
+        agent("still", "vehicle", [-0.5, 0.0], [[5, 5], [5, 5]], map_patch=patch),
+        agent("own-map", "vehicle", [-0.5, 0.0], [[0, 0], [1, 1]], headings=[0.7, 0.7], map_patch=patch),
         agent("invalid", "unknown", 0.0, [[2, 9]]),
         agent("far", "cyclist", [-0.5, 0.0], np.array([[9e6, 9e6], [9e6, 9e6 + 1]])),
         *(agent(f"{n}", "pedestrian", [-0.5, 0.0], np.array([[n, 3], [n, 3.2]])) for n in range(30)),
@@ -64,7 +64,7 @@ def test_writes_other_formats(tmp_path: Path, suffix: str) -> None:
 
 
 def test_nothing_to_draw(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="nothing to draw"):
+    with pytest.raises(ValueError, match="nothing to plot"):
         plot(PredictRequest(), answer(PredictRequest()), tmp_path / "x.png")
 
 

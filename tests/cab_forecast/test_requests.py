@@ -126,9 +126,21 @@ def test_rasters_and_patches() -> None:
     with pytest.raises(ValueError, match=r"\[3, 100, 100\]"):
         map_patch(np.zeros((3, 100, 99)))
     near, far = map_patch(np.zeros((3, 100, 100))), map_patch(np.ones((3, 100, 100)))
-    both = agent("a", "vehicle", [0.0], [[1.0, 2.0]], patch=near, far_map_patch=far)
+    both = agent("a", "vehicle", [0.0], [[1.0, 2.0]], map_patch=near, far_map_patch=far)
     assert (both.map_patch, both.far_map_patch) == (near, far)
-    assert not agent("a", "vehicle", [0.0], [[1.0, 2.0]], patch=near).HasField("far_map_patch")
+    assert not agent("a", "vehicle", [0.0], [[1.0, 2.0]], map_patch=near).HasField("far_map_patch")
+
+
+def test_the_old_names_of_arguments_are_aliases() -> None:
+    near = map_patch(np.zeros((3, 100, 100)))
+    one = [0.0], [[1.0, 2.0]]
+    assert agent("a", "vehicle", *one, patch=near) == agent("a", "vehicle", *one, map_patch=near)
+    with pytest.raises(ValueError, match="either map_patch or its alias patch"):
+        agent("a", "vehicle", *one, map_patch=near, patch=near)
+    assert predict_request(1.0, [], blind=True) == predict_request(1.0, [], context="blind")
+    assert predict_request(1.0, [], blind=False) == predict_request(1.0, [], context="full")
+    with pytest.raises(ValueError, match="either context or its alias blind"):
+        predict_request(1.0, [], context="blind", blind=True)
 
 
 def test_options() -> None:
@@ -151,7 +163,7 @@ def test_options() -> None:
         samples=3,
         seed=0,
         horizon=1.5,
-        blind=True,
+        context="blind",
         strict=True,
         history="memory",
         consistency=True,
@@ -165,6 +177,8 @@ def test_options() -> None:
     assert options.history == HISTORY_SOURCE_MEMORY
     assert options.consistency
     assert not options.merge
+    with pytest.raises(ValueError, match="full, blind, not 'none'"):
+        predict_request(1.0, [], context="none")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="request, memory, not 'both'"):
         predict_request(1.0, [], history="both")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="range"):

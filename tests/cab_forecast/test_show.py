@@ -47,7 +47,7 @@ def test_says_everything() -> None:
         "car-straight vehicle OK 55 % straight on 10.0, +0.0 30.0, +0.0 60.0, +0.0 4.9 × 1.9",
         "20 % bears left 41° 10.0, +0.9 29.2, +6.2 54.3, +22.3 4.9 × 1.9",
         "15 % bears right 41° 10.0, -0.9 29.2, -6.2 54.3, -22.3 4.9 × 1.9",
-        "10 % other ways",
+        "10 % other modes",
     ]
     assert "truck-behind: FALLBACK by kalman@2.0.0: [this] type is not known" in text
     assert "[bad]: INVALID: agents[0].states: one state is too few" in text
@@ -61,7 +61,7 @@ def test_without_the_request_positions_are_those_of_the_ground_frame() -> None:
     assert "straight on" not in text
     (straight,) = (line for line in text.splitlines() if line.startswith("car-straight"))
     assert " ".join(straight.split()) == "car-straight OK 55 % 17.0, -5.2 37.0, -5.2 67.0, -5.2 4.9 × 1.9"
-    assert sum("10 %" in line and "other ways" in line for line in text.splitlines()) == 11
+    assert sum("10 %" in line and "other modes" in line for line in text.splitlines()) == 11
 
 
 def test_an_agent_that_looks_nowhere_has_no_ahead() -> None:
@@ -123,12 +123,12 @@ def test_what_became_of_the_memory() -> None:
     response.timing.tracking = 0.0015
     assert shown(response).rstrip().splitlines()[-2].endswith("track memory new, 1.5 ms")
     response.tracking = TRACKING_STATUS_UNAVAILABLE
-    assert "warning: the track memory did not answer in time" in shown(response)
+    assert "warning: the track memory did not respond in time" in shown(response)
     response.tracking = TRACKING_STATUS_RESET
     response.forecasts[1].tracking = TRACKING_STATUS_RESET
     text = shown(response)
-    assert "warning: what the server remembered of the scene is gone" in text
-    assert "begins anew: truck-behind" in text
+    assert "warning: the server no longer has the tracks of the scene" in text
+    assert "start anew: truck-behind" in text
 
 
 def test_an_empty_answer() -> None:

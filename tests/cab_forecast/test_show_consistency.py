@@ -8,7 +8,7 @@ from rich.console import Console
 
 from cab.forecast.v1 import consistency_service_pb2 as pb
 from cab.forecast.v1.model_service_pb2 import ModelReference
-from cab_forecast.show_consistency import print_event, print_instants, print_models, print_scene
+from cab_forecast.show import print_event, print_instants, print_models, print_scene
 
 MODEL = ModelReference(name="fan", version="1.0.0")
 PART = pb.InstantConsistency(
@@ -62,9 +62,9 @@ def test_a_scene() -> None:
     assert any("[bold]" in line for line in lines)
     assert any("12345" in line for line in lines)
     assert shown(print_scene, pb.GetSceneConsistencyResponse()) == [
-        "nothing that was forecast was observed yet",
+        "no forecast has been observed yet",
         "",
-        "no forecasts were settled yet",
+        "no forecasts are settled yet",
     ]
 
 

@@ -115,7 +115,7 @@ def test_a_missing_matplotlib_is_found_before_the_call(
     monkeypatch.setitem(sys.modules, "matplotlib.axes", None)
     result = run(app, ["predict", "demo", "--plot", "out.png"])
     assert result.exit_code == 1
-    assert result.stderr == 'error: pictures need matplotlib: pip install "cab-forecast[plot]"\n'
+    assert result.stderr == 'error: plots need matplotlib: pip install "cab-forecast[plot]"\n'
     assert not script.calls
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cab_forecast import agent
-from cab_forecast.courses import heading_now, in_words, seen_from
+from cab_forecast.maneuvers import current_heading, describe_maneuver, to_agent_frame
 
 STEP = 0.5
 
@@ -39,21 +39,21 @@ def path(speeds: list[float], turn: float = 0.0, start: float = 0.0) -> np.ndarr
         (path([2, 2], turn=-40, start=-math.pi), "backs up, turning 40°"),
     ],
 )
-def test_in_words(made: np.ndarray, words: str) -> None:
-    assert in_words(made, STEP) == words
+def test_describe_maneuver(made: np.ndarray, words: str) -> None:
+    assert describe_maneuver(made, STEP) == words
 
 
-def test_seen_from_an_agent() -> None:
+def test_to_agent_frame() -> None:
     looks_north = agent("a", "vehicle", [0.0], [[100.0, 200.0]], headings=[math.pi / 2])
-    heading = heading_now(looks_north)
+    heading = current_heading(looks_north)
     assert heading == math.pi / 2
     points = np.array([[[100.0, 210.0], [97.0, 200.0]]])
-    np.testing.assert_allclose(seen_from(looks_north, heading, points), [[[10, 0], [0, 3]]], atol=1e-9)
+    np.testing.assert_allclose(to_agent_frame(looks_north, heading, points), [[[10, 0], [0, 3]]], atol=1e-9)
 
 
 def test_the_heading_is_that_of_motion_where_none_is_given() -> None:
     drives = agent("a", "vehicle", [0.0, 0.5, 1.0], [[0.0, 0.0], [0.0, -3.0], [0.05, -3.0]])
-    heading = heading_now(drives)
+    heading = current_heading(drives)
     assert heading is not None
     assert heading == pytest.approx(-math.pi / 2, abs=0.02)
-    assert heading_now(agent("a", "vehicle", [0.0, 0.5], [[0.0, 0.0], [0.1, 0.0]])) is None
+    assert current_heading(agent("a", "vehicle", [0.0, 0.5], [[0.0, 0.0], [0.1, 0.0]])) is None

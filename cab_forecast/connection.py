@@ -1,0 +1,140 @@
+"""Connection to a server: the client's settings, and the interface of the transports."""
+
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Literal, Protocol
+
+from cab.forecast.v1.routes import Request, Response, Route
+from cab_forecast.endpoints import Endpoint, parse_endpoint
+from cab_forecast.streams import OpenStream, Stream
+from cab_forecast.timing import Budget
+
+DEFAULT_TIMEOUT = 5.0
+"""Seconds for a call, retries included."""
+DEFAULT_RETRIES = 2
+
+Encoding = Literal["protobuf", "json"]
+
+
+@dataclass(frozen=True)
+class Connection:
+    """Everything that a transport needs to reach a server."""
+
+    endpoint: Endpoint
+    token: str | None
+    encoding: Encoding
+    """Encoding of REST bodies; gRPC always uses protobuf."""
+    ca_file: Path | None
+    """PEM certificates to trust instead of the system's; None: the system's."""
+
+
+class Transport(Protocol):
+    """Blocking transport; each method makes one attempt."""
+
+    def call(self, route: Route[Request, Response], request: Request, budget: Budget) -> Response:
+        """Send a request and wait for the response.
+
+        Raises:
+            ForecastError: the call failed.
+        """
+        ...
+
+    def open(self, route: Route[Request, Response], request: Request, budget: Budget) -> Stream[Response]:
+        """Send a request and wait until the server has started to respond; the budget ends there.
+
+        Raises:
+            ForecastError: the call failed.
+        """
+        ...
+
+    def close(self) -> None:
+        """Close the connections."""
+        ...
+
+
+class AsyncTransport(Protocol):
+    """Transport for asyncio; each method makes one attempt."""
+
+    async def call(self, route: Route[Request, Response], request: Request, budget: Budget) -> Response:
+        """See ``Transport.call``."""
+        ...
+
+    async def open(
+        self, route: Route[Request, Response], request: Request, budget: Budget
+    ) -> OpenStream[Response]:
+        """See ``Transport.open``."""
+        ...
+
+    async def close(self) -> None:
+        """Close the connections."""
+        ...
+
+
+class ClientSettings:
+    """Validated arguments of a client."""
+
+    def __init__(
+        self,
+        endpoint: str,
+        token: str | None,
+        timeout: float,
+        retries: int,
+        *,
+        encoding: Encoding,
+        ca_file: str | PathLike[str] | None,
+    ) -> None:
+        """See ``Client``.
+
+        Raises:
+            ValueError: an argument is out of range.
+        """
+        if retries < 0:
+            raise ValueError(f"retries must not be negative, but is {retries}")
+        if encoding not in ("protobuf", "json"):
+            raise ValueError(f"encoding must be 'protobuf' or 'json', not {encoding!r}")
+        Budget(timeout)  # refuse an invalid timeout here, not at the first call
+        self.connection = Connection(
+            parse_endpoint(endpoint), token, encoding, Path(ca_file) if ca_file is not None else None
+        )
+        if encoding == "json" and self.connection.endpoint.transport == "grpc":
+            raise ValueError("encoding='json' is for http:// and https:// endpoints; gRPC uses protobuf")
+        self.timeout = timeout
+        self.retries = retries
+        self.closed = False
+
+    def budget(self, timeout: float | None) -> Budget:
+        """Start the time budget of one call.
+
+        Args:
+            timeout: seconds; None: the client's timeout.
+
+        Raises:
+            RuntimeError: the client is closed.
+        """
+        if self.closed:
+            raise RuntimeError("this client is closed")
+        return Budget(self.timeout if timeout is None else timeout)
+
+
+def open_transport(connection: Connection) -> Transport:
+    """Return the transport for an endpoint."""
+    # Imported here, so that users of one transport do not load the other.
+    if connection.endpoint.transport == "grpc":
+        from cab_forecast.grpc_transport import GrpcTransport  # noqa: PLC0415
+
+        return GrpcTransport(connection)
+    from cab_forecast.rest_transport import RestTransport  # noqa: PLC0415
+
+    return RestTransport(connection)
+
+
+def open_async_transport(connection: Connection) -> AsyncTransport:
+    """Return the transport for an endpoint, for asyncio."""
+    if connection.endpoint.transport == "grpc":
+        from cab_forecast.grpc_transport import AsyncGrpcTransport  # noqa: PLC0415
+
+        return AsyncGrpcTransport(connection)
+    from cab_forecast.rest_transport import AsyncRestTransport  # noqa: PLC0415
+
+    return AsyncRestTransport(connection)
