@@ -130,7 +130,7 @@ class TrajectoryMixture:
 MERGE_DISTANCE_M = 2.0
 """m; maximum distance of a mode from a heavier one that it is merged into."""
 MERGE_RELATIVE_DISTANCE = 0.2
-"""The same as a share of the distance that the heavier mode has gone; the larger of both applies."""
+"""Maximum distance as a share of the distance that the heavier mode has gone; the larger of both applies."""
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,1 @@
-"""What a network takes of a scene."""
+"""The inputs that networks take of a scene."""

@@ -1,7 +1,7 @@
 """The specification of a network's features: in which frame they are, and what of a scene they show.
 
-Every network's configuration (``model.networks.config``) states it as ``features``. It stands here, below the
-networks, because features are made for caches and baselines of comparison without any network, too.
+Every network's configuration (``model.networks.config``) states it as ``features``. It is defined below the
+networks, so that making features needs no network.
 """
 
 from dataclasses import dataclass
@@ -21,17 +21,17 @@ class Frame(StrEnum):
 
 @dataclass(frozen=True)
 class FeatureSpec:
-    """What ``model.features.scene_features.network_features`` makes of a scene."""
+    """The features that ``model.features.scene_features.network_features`` makes of a scene."""
 
     frame: Frame
     neighbor_types: tuple[AgentType, ...]
     """Types of neighbours that are seen; empty: no neighbours."""
     uses_map: bool
-    """Whether vehicles see the near map patch; pedestrians never do (Trajectron++ for nuScenes)."""
+    """True if vehicles see the near map patch; pedestrians never do (Trajectron++ for nuScenes)."""
     far_map: bool = False
-    """Whether vehicles also see the far map patch (agent frame only)."""
+    """True if vehicles also see the far map patch (agent frame only)."""
     neighbor_boxes: bool = False
-    """Whether neighbours are boxes (``model.features.neighbor_boxes``) instead of summed histories (ground
+    """True if neighbours are boxes (``model.features.neighbor_boxes``) instead of summed histories (ground
     frame only)."""
 
     def looks_at_map(self, agent_type: AgentType) -> bool:

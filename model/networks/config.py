@@ -21,7 +21,7 @@ class BlindContext(StrEnum):
     NONE = "none"
     """No blind forecast (Trajectron++, HalentNet)."""
     NULL = "null"
-    """The same network with a null context (CAB, section 3)."""
+    """Blind forecasts by the same network, with a null context (CAB, section 3)."""
     OWN = "own"
     """A second latent and decoder on the history encoding (released Reweight and RUBiZ)."""
 
@@ -37,11 +37,11 @@ class NetworkConfig(BaseModel):
     neighbor_types: tuple[AgentType, ...] = (AgentType.VEHICLE, AgentType.PEDESTRIAN)
     """Types of neighbours that are seen; empty: no neighbours."""
     uses_map: bool = True
-    """Whether vehicles see the map; pedestrians never do (Trajectron++ for nuScenes)."""
+    """True if vehicles see the map; pedestrians never do (Trajectron++ for nuScenes)."""
     frame: Frame = Frame.GROUND
     """Frame of features and forecasts; checkpoints without this field use the ground frame."""
     far_map: bool = False
-    """Whether vehicles also see a map patch that reaches as far as 6 s (agent frame only)."""
+    """True if vehicles also see a map patch that reaches as far as 6 s (agent frame only)."""
     min_sigma_m: tuple[NonNegativeFloat, NonNegativeFloat] = (0.1, 0.3)
     """m, minimum standard deviation of a forecast in any direction, at 1 s and at 6 s, linear in between
     (agent frame only)."""
@@ -91,7 +91,7 @@ class NetworkConfig(BaseModel):
 
     @property
     def supports_blind(self) -> bool:
-        """Whether the network can forecast from an agent's own history alone."""
+        """True if the network can forecast from an agent's own history alone."""
         return self.blind is not BlindContext.NONE
 
 
@@ -136,7 +136,7 @@ class CoverNetConfig(BaseModel):
 
     @property
     def supports_blind(self) -> bool:
-        """Whether the network can forecast from an agent's own history alone."""
+        """True if the network can forecast from an agent's own history alone."""
         return False
 
 

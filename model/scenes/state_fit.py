@@ -123,7 +123,7 @@ class _Motion:
     course: Floats
     """rad, direction of the velocity."""
     course_known: Bools
-    """Whether the velocity is fast enough, and enough above the noise, to have a direction."""
+    """Mask of velocities that are fast enough, and enough above the noise, to have a direction."""
     course_rate: Floats
     """rad/s."""
     course_variance: Floats

@@ -100,6 +100,7 @@ def test_a_cache_of_boxes(tmp_path: Path) -> None:
     _build(tmp_path / "cache", config=config)
     cache = Cache.open(tmp_path / "cache", CacheKey.of(READER, "some", Protocol.CAUSAL, config, FRAMES))
     assert cache.neighbor_boxes is not None
+    assert (tmp_path / "cache/surroundings.npy").is_file()  # as in caches from before the name changed
     assert not cache.neighbors
     assert not list((tmp_path / "cache").glob("neighbors.*"))
     pairs = [(whole, pair) for whole in RECORDS for pair in whole.pairs]

@@ -10,7 +10,7 @@ from loadtest.forward import cab_network
 from model.arrays import Ints
 from model.forecaster import Context, ModelInfo, join
 from model.networks.config import BlindContext, NetworkConfig
-from model.networks.forecaster import CvaeForecaster, CvaeNetworks
+from model.networks.forecaster import MIN_VARIANCE, CvaeForecaster, CvaeNetworks, network_mixture
 from model.scenes.resample import resample
 from model.scenes.scene import AgentType, Raster, Scene
 from tests.model.builders import observations
@@ -54,6 +54,20 @@ def test_shapes_and_sanity(model: CvaeForecaster, context: Context) -> None:
     torch.testing.assert_close(mixture.weights.sum(1), torch.ones(6))
     assert (torch.linalg.eigvalsh(mixture.covariances.double()) > 0).all()
     assert model(scene(), VEHICLES, context, steps=4).means.shape == (6, 25, 4, 2)
+
+
+def test_the_minimum_variance_is_added_where_it_is_asked_for(model: CvaeForecaster) -> None:
+    network, features = model.networks.of(AgentType.VEHICLE), model.prepare(scene(), VEHICLES)
+    plain = network_mixture(network, features, Context.FULL, 12)
+    served = model.forecast(features, AgentType.VEHICLE)
+    torch.testing.assert_close(served.means, plain.means)
+    torch.testing.assert_close(served.log_weights, plain.log_weights)
+    trace = plain.covariances.diagonal(dim1=-2, dim2=-1).sum(-1)
+    added = (MIN_VARIANCE + 1e-6 * trace)[..., None, None] * torch.eye(2)
+    torch.testing.assert_close(served.covariances, plain.covariances + added, rtol=0, atol=0)
+    assert not torch.equal(served.covariances, plain.covariances)
+    flat = network_mixture(network, features, Context.FULL, 12, min_variance=1.0)
+    assert (torch.linalg.eigvalsh(flat.covariances.double()) >= 1.0 - 1e-4).all()
 
 
 @pytest.mark.parametrize("context", list(Context))
