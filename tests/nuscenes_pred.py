@@ -15,13 +15,13 @@ STEP = 0.5
 def real_request(
     data: Path, split: str, scene: str, frame: int | None = None, history: int = 9
 ) -> pb.PredictRequest:
-    """All vehicles that are there at a frame, with up to ``history`` frames, and the scene's raster.
+    """Return a request for all vehicles at a frame, with up to ``history`` frames, and the scene's raster.
 
     Args:
-        data: the folder nuscenes_pred.
+        data: folder nuscenes_pred.
         split: "train" or "val".
-        scene: "scene-0103", say.
-        frame: None: the frame with the most vehicles that have a whole history.
+        scene: name of the scene, such as "scene-0103".
+        frame: number of the frame; None: the frame with the most vehicles that have a whole history.
     """
     tracks = real_tracks(data / f"label/{split}/{scene}.txt")
 
@@ -45,7 +45,7 @@ def real_request(
 
 
 def real_tracks(labels: Path) -> dict[str, dict[int, tuple[float, float, float]]]:
-    """x, y (m) and heading (rad) of a scene's vehicles by frame."""
+    """Return x, y (m) and heading (rad) of a scene's vehicles by frame."""
     tracks: dict[str, dict[int, tuple[float, float, float]]] = {}
     for line in labels.read_text().splitlines():
         row = line.split()
@@ -54,7 +54,7 @@ def real_tracks(labels: Path) -> dict[str, dict[int, tuple[float, float, float]]
 
 
 def real_raster(data: Path, scene: str) -> pb.SceneRaster:
-    """The scene's raster: the files' rows run along x, and their blue is layer 0 (they are BGR)."""
+    """Return the scene's raster: the files' rows run along x, and their blue is layer 0 (they are BGR)."""
     x, y, scale = map(float, (data / f"map_0.1/meta_{scene}.txt").read_text().split())
     image = np.asarray(Image.open(data / f"map_0.1/{scene}.png").convert("RGB"))[:, :, ::-1]
     bits = np.packbits(np.moveaxis(image >= 128, 2, 0))

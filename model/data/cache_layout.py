@@ -60,9 +60,9 @@ class CacheKey(BaseModel):
     neighbor_types: tuple[AgentType, ...]
     """Types in the network's configuration; little else of it changes the arrays, so methods share caches."""
     drawn: bool = False
-    """Whether neighbours are held as boxes to be drawn (CoverNet) instead of summed histories."""
+    """True if neighbours are held as boxes to be drawn (CoverNet) instead of summed histories."""
     agent_frame: bool = False
-    """Whether features are in the agents' own frames. Such caches hold map patches and single neighbours,
+    """True if features are in the agents' own frames. Such caches hold map patches and single neighbours,
     whether or not a network uses them."""
     variants: int = Field(default=0, ge=0)
     """V, number of noisy reports of each pair (``model.data.sensing``) beside the recorded states."""

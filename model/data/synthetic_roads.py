@@ -81,13 +81,13 @@ def draw_line(
 ) -> Floats:
     """Return a road's line [L, 2] from the origin towards +x: straights, arcs, transitions between them.
 
-    It never comes near itself again.
+    The line never comes near itself again.
 
     Args:
-        rng: draws the lengths and radii.
+        rng: random generator.
         length: m.
-        radii: least and greatest radius of arcs, m.
-        turn: rad, the most that one arc turns and that the whole line points away from +x.
+        radii: minimum and maximum radius of arcs, m.
+        turn: rad, maximum turn of an arc, and maximum angle between the line and +x.
         begin: m of straight at the beginning.
     """
     for _ in range(8):
@@ -134,7 +134,7 @@ class Lane:
     d: float
     """m, its middle."""
     ahead: bool
-    """Whether traffic runs as the road's line does."""
+    """True if traffic runs as the road's line does."""
 
 
 @dataclass(frozen=True)
@@ -144,12 +144,12 @@ class Strip:
     d: float
     """m, its middle."""
     across: bool
-    """Whether the cars stand at a right angle to the road."""
+    """True if the cars stand at a right angle to the road."""
 
 
 @dataclass(frozen=True)
 class CrossSection:
-    """What lies beside a road's line."""
+    """Cross section of a road, along the distance d from its line."""
 
     lanes: Sequence[Lane]
     """Those ahead and then those back, each from the middle to the edge."""
@@ -174,7 +174,7 @@ def draw_section(
     """Return a cross section.
 
     Args:
-        rng: draws which dividers are there.
+        rng: random generator.
         ahead: lanes as the line runs.
         back: lanes against it; none: a one-way road with its line in the middle.
         width: of lanes, m.
@@ -231,12 +231,12 @@ class Junction:
     """m, radius of a roundabout's lane; 0: a crossing."""
 
     def connect(self, entry: Floats, exit_: Floats, arms: tuple[int, int]) -> Floats:
-        """Return the way [L, 2] across from the end of one lane to the beginning of another.
+        """Return the path [L, 2], m, across from the end of one lane to the beginning of another.
 
         Args:
             entry: [L, 2], the lane that comes in.
             exit_: [L, 2], the lane that goes out.
-            arms: whose they are.
+            arms: numbers of their arms.
         """
         poses = (entry[-1], entry[-1] - entry[-2], exit_[0], exit_[1] - exit_[0])
         if not self.ring:
@@ -255,8 +255,8 @@ def draw_junction(rng: np.random.Generator, reach: float) -> Junction:
     """Return a crossing of three or four arms, or a roundabout.
 
     Args:
-        rng: draws it.
-        reach: m, length of the arms.
+        rng: random generator.
+        reach: length of the arms, m.
     """
     round_ = rng.random() < 0.15
     bend, slack = rng.uniform(-0.4, 0.4), 0.25 if round_ else 0.5
@@ -288,7 +288,7 @@ def draw_junction(rng: np.random.Generator, reach: float) -> Junction:
 
 
 def _mouth(arm: int, angles: Sequence[float], sections: Sequence[CrossSection], corner: float) -> float:
-    """m from the middle to where an arm's corners, of a radius, end on both sides."""
+    """Return the distance, m, from the middle to where an arm's rounded corners end on both sides."""
     half, least = sections[arm].edges[1], sections[arm].edges[1] + 2.0
     for other in (arm - 1, (arm + 1) % len(angles)):
         apart = abs(float(wrap_angle(np.array(angles[other] - angles[arm]))))
@@ -299,7 +299,7 @@ def _mouth(arm: int, angles: Sequence[float], sections: Sequence[CrossSection], 
 
 
 def _join(start: Floats, ahead: Floats, end: Floats, on: Floats) -> Floats:
-    """A way [V, 2] from a point and direction to another: an arc between straights, or an S."""
+    """Return a path [V, 2] from one point and direction to another: an arc between straights, or an S."""
     ahead, on = ahead / np.hypot(*ahead), on / np.hypot(*on)
     across = ahead[0] * on[1] - ahead[1] * on[0]
     between = end - start
@@ -328,14 +328,14 @@ def _join(start: Floats, ahead: Floats, end: Floats, on: Floats) -> Floats:
 
 
 class Painter:
-    """Draws roads into a raster."""
+    """Painter of roads into a raster."""
 
     def __init__(self, low: Floats, high: Floats, place: Callable[[Floats], Floats]) -> None:
         """
         Args:
             low: [2], m; the raster's origin is the whole metre at or before it.
             high: [2], m, inside the raster.
-            place: brings what is drawn [V, 2], m, to where it lies on the map.
+            place: function that moves drawn points [V, 2], m, to their place on the map.
         """
         self._place = place
         self._origin = np.floor(low)
@@ -344,16 +344,16 @@ class Painter:
         self._draws = [ImageDraw.Draw(image) for image in self._images]
 
     def raster(self) -> Raster:
-        """Return what has been drawn."""
+        """Return the raster as drawn so far."""
         layers = np.stack([np.asarray(image) for image in self._images])
         return Raster(layers, self._origin, PIXELS_PER_METER)
 
     def area(self, points: Floats, value: int = 1) -> None:
-        """Fill a polygon [V, 2], m, as driveable, or with 0 as not."""
+        """Fill a polygon [V, 2], m, as driveable, or, with 0, as not driveable."""
         self._draws[_DRIVEABLE].polygon(self._pixels(points), fill=value)
 
     def ribbon(self, line: Floats, right: float, left: float, value: int = 1) -> None:
-        """Fill what lies between two distances d, m, from a line [L, 2]."""
+        """Fill the area between two distances d, m, from a line [L, 2]."""
         every = int(_SPACING / STEP)
         coarse = np.concatenate([line[:-1:every], line[-1:]])
         self.area(np.concatenate([shifted(coarse, right), shifted(coarse, left)[::-1]]), value)
@@ -382,7 +382,7 @@ class Painter:
             self.divider(layer, shifted(line, d))
 
     def junction(self, junction: Junction) -> None:
-        """Draw the arms and all ways across."""
+        """Draw the arms and all paths across."""
         corners: list[Floats] = []
         for k, arm in enumerate(junction.arms):
             self.road(arm)

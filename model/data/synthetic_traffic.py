@@ -1,6 +1,7 @@
-"""Vehicles of made-up scenes: how they go along the lines that they keep to.
+"""Traffic simulation of made-up scenes: vehicles move along given lines.
 
-Who follows keeps its distance by the intelligent driver model (Treiber, Hennecke and Helbing 2000, eq. 2).
+Following vehicles keep their distance by the intelligent driver model (Treiber, Hennecke and Helbing 2000,
+eq. 2).
 """
 
 from collections.abc import Sequence
@@ -15,21 +16,22 @@ from model.data.synthetic_roads import STEP, headings, places, resample, shifted
 TICK = 0.1
 """s between states of the simulation."""
 _HARDEST = 4.5
-"""m/s², no one brakes harder."""
+"""m/s², maximum braking."""
 _FASTEST = 40.0
-"""m/s, no one wishes to be faster."""
+"""m/s, maximum desired speed."""
 _JERK = 6.0
 """m/s³."""
 _LENGTH = 4.7
-"""m, of a vehicle, bumper to bumper."""
+"""m, length of a vehicle, bumper to bumper."""
 _DISCS = np.array([-1.5, 0.0, 1.5])
+"""m ahead of the middle: a vehicle is three discs in a row."""
 _CLEARANCE = 1.75
-"""A vehicle is three discs in a row: where they are, m, and how near two vehicles' may come."""
+"""m, minimum distance between discs of two vehicles."""
 
 
 @dataclass(frozen=True)
 class Driver:
-    """How somebody drives."""
+    """Parameters of a driver."""
 
     desired: float
     """m/s, on a free straight road."""
@@ -42,11 +44,11 @@ class Driver:
     gap: float
     """m to a standing vehicle ahead."""
     lateral: float
-    """m/s², the most that it takes in curves."""
+    """m/s², maximum lateral acceleration in curves."""
 
 
 def draw_driver(rng: np.random.Generator, desired: float) -> Driver:
-    """Return a driver who would like to go at about a speed, m/s."""
+    """Return a driver whose desired speed is about the given one, m/s."""
     return Driver(
         desired=min(desired * rng.uniform(0.85, 1.15), _FASTEST),
         acceleration=rng.uniform(0.8, 3.0),
@@ -75,41 +77,41 @@ class Vehicle:
     start: float
     """m along the line."""
     speed: float
-    """m/s at the start, less where that would be too fast."""
+    """m/s at the start; lowered where that would be too fast."""
     driver: Driver
     stream: int
     leaves: float = np.inf
-    """m along the line, where it leaves the stream."""
+    """m along the line at which it leaves the stream."""
     joins: int | None = None
     """The stream that it changes to."""
     joined: float = np.inf
-    """m along the line, where it joins that."""
+    """m along the line at which it joins that stream."""
     shift: float = 0.0
     """m, from places along its own stream to those along the other."""
     stop: float = np.inf
-    """m along the line, where its front bumper waits."""
+    """m along the line at which its front bumper waits."""
     until: float = np.inf
-    """When the light turns green."""
+    """Time at which the light turns green."""
     wait: float = np.inf
-    """s that it stands at the line before it goes on its own."""
+    """s that it stands at the line before it goes on by itself."""
     brakes: tuple[float, float, float] = (np.inf, np.inf, 0.0)
-    """From when until when it brakes and then stands, and how hard, m/s²."""
+    """Times between which it brakes and then stands, and its braking, m/s²."""
     changes: tuple[float, float] = (np.inf, 1.0)
-    """When its desired speed changes, and by which factor."""
+    """Time at which its desired speed changes, and the factor."""
     backwards: bool = False
     ends: bool = False
-    """Whether it stops at the end of its line."""
+    """True if it stops at the end of its line."""
     about_lead: bool = False
-    """Whether a vehicle that stands in the lane is what it is about."""
+    """True if it stands in the lane as an obstacle, or reacts to one that does."""
 
 
 def wander(rng: np.random.Generator, line: Floats, most: float, *along: Floats) -> tuple[Floats, ...]:
-    """Return a driver's own line [L', 2] near a given one, a bit aside and never even, and numbers along it.
+    """Return a driver's own line [L', 2] near a given one, a little aside and wavy, and numbers along it.
 
     Args:
-        rng: draws it.
+        rng: random generator.
         line: [L, 2], m, ``STEP`` apart or nearly.
-        most: m, the farthest that it lies beside the line.
+        most: maximum distance from the line, m.
         along: each [L], kept to [L'].
     """
     line, *along_line = resample(line, *along)
@@ -144,7 +146,7 @@ class _Tables:
     """m/s, for curves ahead and the end of the line."""
 
     def at(self, table: Floats, along: Floats) -> Floats:
-        """Values at m along the lines, [N] or [N, T]."""
+        """Return values at distances along the lines, m: [N] or [N, T]."""
         index = np.minimum(along / STEP, table.shape[1] - 1.001)
         whole = index.astype(np.int64)
         part = index - whole
@@ -154,11 +156,11 @@ class _Tables:
 
 
 def simulate(vehicles: Sequence[Vehicle], seconds: float) -> Drives:
-    """Return how vehicles drive.
+    """Return the motion of vehicles.
 
     Args:
-        vehicles: N ≥ 1 of them.
-        seconds: for how long.
+        vehicles: N ≥ 1 vehicles.
+        seconds: duration, s.
     """
     tables = _tables(vehicles)
 
@@ -230,7 +232,7 @@ def _tables(vehicles: Sequence[Vehicle]) -> _Tables:
     for row, one in enumerate(vehicles):
         if one.ends:
             square[row, len(one.line) - 2 :] = 0.0
-    # Slow enough early enough: v² ≤ v² there + 2 b · distance, for every place ahead
+    # The speed allows braking in time: v² ≤ v² there + 2 b · distance, for every place ahead
     slope = 2 * 0.8 * braking * np.arange(longest) * STEP
     square = np.minimum.accumulate((square + slope)[:, ::-1], axis=1)[:, ::-1] - slope
     return _Tables(
@@ -243,7 +245,7 @@ def _tables(vehicles: Sequence[Vehicle]) -> _Tables:
 
 
 class _Following:
-    """Who is behind whom."""
+    """Vehicles that follow each other in streams."""
 
     def __init__(self, vehicles: Sequence[Vehicle]) -> None:
         own = np.array([one.stream for one in vehicles])
@@ -255,7 +257,7 @@ class _Following:
         self._shift = np.array([one.shift for one in vehicles])
 
     def leads(self, place: Floats, along: Floats, speed: Floats) -> tuple[Floats, Floats]:
-        """The free way [N], m (∞: no one ahead), and the speed [N], m/s, of who ends it."""
+        """Return the gap [N], m, to the vehicle ahead (∞: none), and the speed [N], m/s, of that vehicle."""
         there: Bools = np.concatenate([along < self._leaves, along >= self._joined])
         both = np.concatenate([place, place + self._shift])
         apart = both[None] - both[:, None]
@@ -271,12 +273,12 @@ class _Following:
 
 
 def clear(position: Floats, heading: Floats, movers: int) -> Bools:
-    """Return which vehicles, [N], are left when those that touch one before them are taken away.
+    """Return which vehicles, [N], remain if those that touch an earlier one are removed.
 
     Args:
         position: [N, T, 2], m.
         heading: [N, T], rad.
-        movers: how many of them, the first ones, are examined; the others are left, and count as before all.
+        movers: number of moving vehicles, the first ones. The others all remain, and count as earlier ones.
     """
     ahead = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     discs = position[..., None, :] + _DISCS[:, None] * ahead[..., None, :]  # [N, T, 3, 2]

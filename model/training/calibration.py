@@ -37,7 +37,7 @@ _NEAR: Final = 1.02
 """A number within this factor of a bound counts as at the bound."""
 _BATCH: Final = 256
 _TURNS: Final = 3
-"""How often each number is fitted while the other one is fixed."""
+"""Number of times that each number is fitted while the other one is fixed."""
 _ROUNDS: Final = 18
 _GOLDEN: Final = (math.sqrt(5) - 1) / 2
 
@@ -55,7 +55,7 @@ class Calibration(NamedTuple):
 
     @property
     def ran_away(self) -> bool:
-        """Whether a number reached a bound: no factor, or no temperature, suits the network's forecasts."""
+        """True if a number reached a bound: no factor, or no temperature, suits the network's forecasts."""
         numbers = (self.width, self.temperature, self.blind_width or 1.0)
         return any(not MIN_FACTOR * _NEAR < number < MAX_FACTOR / _NEAR for number in numbers)
 
@@ -79,7 +79,7 @@ class HorizonCalibration(NamedTuple):
 
     @property
     def ran_away(self) -> bool:
-        """Whether a number reached a bound of its search."""
+        """True if a number reached a bound of its search."""
         return any(
             not numbers[0] * _NEAR < number < numbers[-1] / _NEAR
             for numbers, fitted in ((_WIDTHS, self.widths), (_TEMPERATURES, (self.temperature,)))

@@ -121,7 +121,7 @@ class TrainingConfig(BaseModel):
     epochs: int = Field(default=40, ge=1)
     batch_size: int = Field(default=256, ge=1)
     calibrate: bool = True
-    """Whether the widths of the forecasts and the temperature of their modes are fitted after training."""
+    """True if the widths of the forecasts and the temperature of their modes are fitted after training."""
     adversarial_batch_size: int = Field(default=256, ge=1)
     """Pairs in the batches of HalentNet's adversarial steps; at most ``batch_size``."""
     kl_weight: float = Field(default=100.0, gt=0)
@@ -167,10 +167,10 @@ class TrainingConfig(BaseModel):
     gradient_clip: float = Field(default=1.0, gt=0)
     """Maximum norm of the gradient."""
     rotate: bool = True
-    """Whether each agent's surroundings are turned by a random multiple of 15° (the map patch is aligned with
+    """True if each agent's surroundings are turned by a random multiple of 15° (the map patch is aligned with
     the agent)."""
     mirror: bool = False
-    """Whether every other agent, at random, has left and right exchanged; as released, no."""
+    """True if every other agent, at random, has left and right exchanged; as released, no."""
     curved_oversampling: int = Field(
         default=2, ge=1, validation_alias=_renamed("curved_copies", "curved_oversampling")
     )
@@ -186,12 +186,12 @@ class TrainingConfig(BaseModel):
     """V, number of noisy reports of each training pair (``model.data.sensing``) beside the recorded states;
     agent frame only."""
     context_dropout: bool = Field(default=False, validation_alias=_renamed("hide", "context_dropout"))
-    """Whether maps and neighbours are dropped at random (``model.data.perturbation``); agent frame only."""
+    """True if maps and neighbours are dropped at random (``model.data.perturbation``); agent frame only."""
     stopped_vehicles: bool = Field(default=False, validation_alias=_renamed("block", "stopped_vehicles"))
-    """Whether a stopped vehicle is inserted beyond where some agents went (``model.data.perturbation``);
+    """True if a stopped vehicle is inserted beyond where some agents went (``model.data.perturbation``);
     agent frame with neighbours only."""
     jitter: bool = False
-    """Whether histories and maps are moved a little each time, and scenes are shown in other sizes
+    """True if histories and maps are moved a little each time, and scenes are shown in other sizes
     (``model.data.perturbation``); agent frame only."""
     weight_decay: float = Field(default=0.0, ge=0)
     """Decoupled weight decay (AdamW, Loshchilov and Hutter 2019), per unit of learning rate."""
@@ -241,7 +241,7 @@ class TrainingConfig(BaseModel):
 
     @property
     def in_agent_frame(self) -> bool:
-        """Whether the network sees and forecasts in the agent's frame."""
+        """True if the network sees and forecasts in the agent's frame."""
         return isinstance(self.network, NetworkConfig) and self.network.frame is Frame.AGENT
 
     @property

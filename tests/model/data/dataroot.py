@@ -37,12 +37,12 @@ _START_US = 1_532_402_927_000_000
 
 
 def token(name: str) -> str:
-    """Thirty-two hexadecimal digits."""
+    """Return thirty-two hexadecimal digits."""
     return hashlib.md5(name.encode(), usedforsecurity=False).hexdigest()
 
 
 def write_dataroot(root: Path) -> None:
-    """Writes all files."""
+    """Write all files."""
     tables = root / "v1.0-mini"
     tables.mkdir(parents=True)
     for name, rows in _tables().items():

@@ -17,7 +17,7 @@ def track(
     frames: Sequence[int] | None = None,
     kind: AgentType = AgentType.VEHICLE,
 ) -> Track:
-    """A track along positions [F, 2] with headings [F] (or one for all), from frame 0 on if not told."""
+    """Return a track of positions [F, 2] and headings [F] (or one for all), by default from frame 0 on."""
     points = np.asarray(position, dtype=np.float64)
     numbers = np.arange(len(points)) if frames is None else np.asarray(frames)
     headings = np.broadcast_to(np.asarray(heading, dtype=np.float64), len(points)).copy()
@@ -31,7 +31,7 @@ def raster(
     scale: float = 3.0,
     seed: int = 0,
 ) -> Raster:
-    """Noise in blocks of four pixels."""
+    """Return a raster of noise in blocks of four pixels."""
     rng = np.random.default_rng(seed)
     blocks = rng.integers(0, 2, (3, -(-rows // 4), -(-columns // 4)), dtype=np.uint8)
     layers = blocks.repeat(4, axis=1).repeat(4, axis=2)[:, :rows, :columns]
@@ -39,7 +39,7 @@ def raster(
 
 
 def record(name: str = "scene-1", seed: int = 0, vehicles: int = 4, token: bool = True) -> SceneRecord:
-    """Agents that wander about (1000, 2000) for 24 frames: vehicles, one with a gap and one that comes
+    """Return agents that wander about (1000, 2000) for 24 frames: vehicles, one with a gap and one that comes
     late, and a pedestrian; every vehicle's every possible pair but those right after the gap."""
     rng = np.random.default_rng(seed)
     tracks = []
@@ -67,7 +67,7 @@ def record(name: str = "scene-1", seed: int = 0, vehicles: int = 4, token: bool 
 
 
 def turned(scene: SceneRecord, angle: float, center: ArrayLike) -> SceneRecord:
-    """The record turned about a point, without its raster."""
+    """Return the record turned about a point, without its raster."""
     middle = np.asarray(center, dtype=np.float64)
     tracks = [
         Track(
@@ -105,7 +105,7 @@ class FixedReader:
         return ("some", "none")
 
     def scenes(self, split: str) -> Iterator[SceneRecord]:
-        """The records."""
+        """Return the records."""
         if split == "some":
             yield from self._records
         if self._fails:

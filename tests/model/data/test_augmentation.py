@@ -102,7 +102,7 @@ def test_a_quarter_turn() -> None:
 
 
 def reflected(scene: SceneRecord) -> SceneRecord:
-    """The record with y for −y, its raster too."""
+    """Return the record with y for −y, its raster too."""
     tracks = [
         Track(one.id, one.type, one.frames, one.position * np.array([1.0, -1.0]), -one.heading)
         for one in scene.tracks
@@ -117,7 +117,7 @@ def reflected(scene: SceneRecord) -> SceneRecord:
 def _features_and_future(
     whole: SceneRecord, frame: int, index: int, protocol: Protocol
 ) -> tuple[Features, torch.Tensor]:
-    """Features of a track at a frame, boxes of the agents around among them, and its future."""
+    """Return features of a track at a frame, boxes of the agents around among them, and its future."""
     scene, tracks = frame_scene(whole, frame, protocol, 5)
     target = np.flatnonzero(tracks == index)
     features = ground_frame_features(scene, target, VEHICLE, CONFIG.features, Context.FULL)

@@ -52,7 +52,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Cache:
 
 
 def _exact(whole: SceneRecord, position: Floats, heading: float) -> Floats:
-    """One patch in [-1, 1], bilinear in float64."""
+    """Return one patch in [-1, 1], bilinear in float64."""
     picture, (cos, sin) = whole.raster, (np.cos(heading), np.sin(heading))
     zoom = picture.pixels_per_meter / 3.0
     ahead, left = zoom * (np.arange(100)[:, None] - 10.0), zoom * (np.arange(100)[None, :] - 50.0)

@@ -34,14 +34,14 @@ def dataroot(shared: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def records(dataroot: Path) -> dict[str, SceneRecord]:
-    """All mini scenes by name."""
+    """Return all mini scenes by name."""
     reader = NuscenesReader(dataroot)
     return {record.name: record for split in ("mini_train", "mini_val") for record in reader.scenes(split)}
 
 
 @pytest.fixture
 def made(tmp_path: Path) -> Path:
-    """A dataroot of one scene."""
+    """Return a dataroot of one scene."""
     write_dataroot(tmp_path / "nuscenes")
     return tmp_path / "nuscenes"
 

@@ -42,7 +42,7 @@ ROWS = [*(_row(frame, asked=int(frame == 4)) for frame in range(17)), _row(3, ag
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A whole data set of one scene."""
+    """Return a whole data set of one scene."""
     _write(tmp_path, ROWS)
     return tmp_path
 

@@ -177,7 +177,7 @@ def test_all_stay_or_all_leave(share: float, stay: bool) -> None:
 
 
 def alone(count: int) -> Features:
-    """Features of agents with no neighbour but the first one."""
+    """Return features of agents with no neighbour but the first one."""
     features = features_in_agent_frame(count)
     features["neighbors"][:, 1:] = 0.0
     return features

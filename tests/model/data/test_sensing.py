@@ -16,7 +16,7 @@ FRAMES = 5
 
 
 def _changed_after(scene: SceneRecord, frame: int) -> SceneRecord:
-    """The record with another future."""
+    """Return the record with another future."""
     tracks = [
         replace(
             one,

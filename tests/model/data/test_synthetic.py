@@ -74,7 +74,7 @@ def test_splits() -> None:
 
 @pytest.mark.parametrize("seed", ["-1", "one", "1.5", "a/0", "²"])
 def test_what_is_no_seed_is_said(seed: str) -> None:
-    with pytest.raises(DataError, match=f"synthetic:{seed}: not a seed"):
+    with pytest.raises(DataError, match=f"synthetic:{seed}: the seed is not"):
         READERS["synthetic"](Path(seed))
 
 
@@ -93,7 +93,7 @@ def test_they_are_what_training_takes(records: list[SceneRecord]) -> None:
 
 
 def _steps(track: Track) -> tuple[Floats, Floats, Floats]:
-    """Speed [F - 1], m/s, signed by the heading halfway, course relative to that, and turn, rad."""
+    """Return speed [F - 1], m/s, signed by the heading halfway, course relative to that, and turn, rad."""
     moved = np.diff(track.position, axis=0)
     turn = wrap_angle(np.diff(track.heading))
     slip = wrap_angle(np.arctan2(moved[:, 1], moved[:, 0]) - track.heading[:-1] - turn / 2)

@@ -9,7 +9,7 @@ from model.scenes.scene import Raster
 
 
 def random_mixture(seed: int, agents: int = 3, modes: int = 4, steps: int = 12) -> TrajectoryMixture:
-    """Well-conditioned Gaussians, float64."""
+    """Return well-conditioned Gaussians, float64."""
     generator = torch.Generator().manual_seed(seed)
     shape = (agents, modes, steps)
     factor = torch.randn(*shape, 2, 2, generator=generator, dtype=torch.float64)
@@ -22,13 +22,13 @@ def random_mixture(seed: int, agents: int = 3, modes: int = 4, steps: int = 12) 
 
 
 def certain(mixture: TrajectoryMixture) -> TrajectoryMixture:
-    """The same without any spread within a mode."""
+    """Return a mixture without any spread within a mode."""
     return TrajectoryMixture(
         mixture.log_weights, mixture.means, torch.zeros_like(mixture.covariances), mixture.origin
     )
 
 
 def raster(driveable: Bytes, pixels_per_meter: float = 1.0, origin: tuple[float, float] = (0, 0)) -> Raster:
-    """A map of one layer [rows, columns]; the other two are empty."""
+    """Return a map of one layer [rows, columns]; the other two are empty."""
     layers = np.stack([driveable, np.zeros_like(driveable), np.zeros_like(driveable)])
     return Raster(layers, np.array(origin, dtype=np.float64), pixels_per_meter)

@@ -14,7 +14,7 @@ seeds = st.integers(0, 10_000)
 
 
 def _one(variance: float = 1.0, modes: int = 1) -> TrajectoryMixture:
-    """Equal round Gaussians at (100, −50), one step."""
+    """Return equal round Gaussians at (100, −50), one step."""
     return TrajectoryMixture(
         torch.zeros(1, modes).log_softmax(-1),
         torch.zeros(1, modes, 1, 2),

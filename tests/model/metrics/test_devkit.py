@@ -18,7 +18,7 @@ KS = (1, 5, 10)
 
 @pytest.fixture(scope="module")
 def devkit() -> ModuleType:
-    """nuscenes.eval.prediction.metrics."""
+    """Return the module nuscenes.eval.prediction.metrics."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # its dependencies'
         return _import("nuscenes.eval.prediction.metrics", "nuscenes-devkit is not installed")
@@ -32,7 +32,7 @@ def _import(name: str, reason: str) -> ModuleType:
 
 
 def _predictions(seed: int, modes: int) -> tuple[Floats, Floats, Floats]:
-    """Modes [20, K, 12, 2], probabilities [20, K], truths [20, 12, 2]."""
+    """Return modes [20, K, 12, 2], probabilities [20, K], truths [20, 12, 2]."""
     rng = np.random.default_rng(seed)
     truth = np.cumsum(rng.normal(1, 1, (20, 12, 2)), axis=1) + 400
     noise = np.cumsum(rng.normal(0, 0.3, (20, modes, 12, 2)), axis=2)

@@ -40,12 +40,12 @@ class MadeUpPairs:
         return turned(self._future, -present_heading(self._features))
 
     def batch(self, indices: Tensor, turns: Tensor | None = None) -> tuple[Features, Tensor]:
-        """As a BatchSource; turning is left out."""
+        """Return pairs as a BatchSource does; turning is left out."""
         return {name: t[indices] for name, t in self._features.items()}, self._future[indices]
 
 
 def small_config(method: Method = Method.CAB, epochs: int = 2, **changes: object) -> TrainingConfig:
-    """A run of seconds."""
+    """Return settings of a run of seconds."""
     blind = {Method.CAB: BlindContext.NULL, Method.TRAJECTRON: BlindContext.NONE}.get(
         method, BlindContext.OWN
     )

@@ -1,4 +1,4 @@
-"""How sure forecasts are of themselves, fitted after training."""
+"""Calibration after training."""
 
 import copy
 import math
@@ -30,7 +30,7 @@ from tests.model.training.fakes import MadeUpPairs, small_config
 
 @pytest.fixture
 def network() -> AgentNetwork:
-    """One whose modes differ, in where they lead and in how likely they are."""
+    """Return a network whose modes differ, in where they lead and in how likely they are."""
     torch.manual_seed(0)
     modes = 5
     network = AgentNetwork(NetworkConfig(modes=modes), AgentType.VEHICLE).eval()
@@ -106,7 +106,7 @@ def test_covernet_is_calibrated_by_its_spread_and_its_logits() -> None:
 
 
 def validation_nll(network: CoverNet, pairs: MadeUpPairs) -> float:
-    """Mean over pairs and steps, nats."""
+    """Return the mean over pairs and steps, nats."""
     features, future = pairs.batch(torch.arange(len(pairs)))
     origin = features["origin"]
     with torch.no_grad():
@@ -133,7 +133,7 @@ def test_what_is_built_in_is_what_was_fitted(kind: BlindContext, bound: float | 
 
 
 def check_built_in(network: AgentNetwork | CoverNet, context: Context) -> None:
-    """By what a network says in a context before and after."""
+    """Compare a network's forecasts in a context before and after."""
     blind_width = 0.4
     calibration = Calibration(width=1.7, temperature=3.0, blind_width=blind_width)
     features, _ = MadeUpPairs(6).batch(torch.arange(6))

@@ -1,4 +1,4 @@
-"""What CoverNet learns by."""
+"""The objective of CoverNet."""
 
 import pytest
 import torch
@@ -14,7 +14,7 @@ PAIRS = MadeUpPairs(12)
 
 
 def terms(displacement: float) -> tuple[CoverNetLearner, dict[str, float]]:
-    """A learner after one step, and what that said."""
+    """Return a learner after one step, and the step's terms."""
     torch.manual_seed(0)
     learner = CoverNetLearner(small_config(Method.COVERNET), PAIRS.paths, torch.device("cpu"))
     learner.networks.eval()

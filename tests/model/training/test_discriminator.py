@@ -1,4 +1,4 @@
-"""What HalentNet's discriminator sees, and says."""
+"""Input and output of HalentNet's discriminator."""
 
 import pytest
 import torch

@@ -20,7 +20,7 @@ WEIGHTS = LossWeights(kl=1.0, logit_clip=5.0)
 
 
 def batch(start: int) -> Batch:
-    """Four of the pairs."""
+    """Return four of the pairs."""
     return Batch(*PAIRS.batch(torch.arange(start, start + 4)))
 
 
@@ -32,12 +32,12 @@ def learner() -> HalentLearner:
 
 
 def parameters(module: torch.nn.Module) -> dict[str, torch.Tensor]:
-    """Copies; what a forward alone changes (spectral norms) is not among them."""
+    """Return copies; what a forward alone changes (spectral norms) is not among them."""
     return {name: parameter.detach().clone() for name, parameter in module.named_parameters()}
 
 
 def same(module: torch.nn.Module, before: dict[str, torch.Tensor]) -> bool:
-    """Whether nothing was learned since."""
+    """Return whether nothing was learned since."""
     return all(torch.equal(parameter, before[name]) for name, parameter in module.named_parameters())
 
 

@@ -27,7 +27,7 @@ PAIRS = MadeUpPairs(48)
 
 
 def validate(networks: Networks[Any]) -> dict[str, float]:
-    """FDE of the likeliest mode on the training pairs."""
+    """Return the FDE of the likeliest mode on the training pairs."""
     features, future = PAIRS.batch(torch.arange(len(PAIRS)))
     with torch.no_grad():
         log_weights, positions = networks.of(AgentType.VEHICLE)(features, Context.FULL, 12)
@@ -36,7 +36,7 @@ def validate(networks: Networks[Any]) -> dict[str, float]:
 
 
 def train(config: TrainingConfig, folder: Path) -> tuple[Trainer, list[dict[str, float]]]:
-    """Runs to the end; the figures of each epoch."""
+    """Run to the end; return the trainer and the figures of each epoch."""
     reports: list[dict[str, float]] = []
     trainer = Trainer(config, PAIRS, validate, folder, torch.device("cpu"))
 

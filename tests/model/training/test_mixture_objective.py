@@ -40,7 +40,7 @@ def future() -> Tensor:
 
 
 def only(**weights: float) -> MixtureWeights:
-    """Weights of which all others are zero."""
+    """Return weights of which all others are zero."""
     return MixtureWeights.model_validate(NOTHING | weights)
 
 
@@ -51,7 +51,7 @@ def value(network: AgentFrameNetwork, features: Features, future: Tensor, weight
 def reference(
     network: AgentFrameNetwork, features: Features, future: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Probabilities [N, K], distances [N, K, T] and log-densities [N, K, T] out of the forward itself."""
+    """Return probabilities [N, K], distances [N, K, T] and log-densities [N, K, T] of the forward itself."""
     turned = features | {"heading": torch.zeros(len(future), dtype=torch.float64)}
     with torch.no_grad():
         log_weights, positions = network(turned, Context.FULL, STEPS)
@@ -153,7 +153,7 @@ def test_a_part_of_the_batch_may_be_forecast_blindly(
 
 
 def with_one_neighbor(features: Features, x: float, y: float, vx: float) -> Features:
-    """Features in which everyone's only neighbour is at that place, m and m/s in the own frame."""
+    """Return features in which everyone's only neighbour is at that place, m and m/s in the own frame."""
     neighbors = torch.zeros_like(features["neighbors"])
     neighbors[:, 0, 0], neighbors[:, 0, 1] = x / NEIGHBOR_POSITION_SCALE, y / NEIGHBOR_POSITION_SCALE
     neighbors[:, 0, 4] = vx / NEIGHBOR_VELOCITY_SCALE

@@ -79,7 +79,7 @@ if torch.backends.cpu.get_cpu_capability() == "AVX2":
     # 59 are within 1 % there, and with every step rounded anew 8 to 21 are
     WITHIN_ONE_PERCENT["trajectron"] = 0.83
 NEXT_TO_NOTHING = 3e-3
-"""Of the greatest gradient's norm."""
+"""Share of the greatest gradient's norm."""
 
 
 class Golden(NamedTuple):
@@ -93,23 +93,23 @@ class Golden(NamedTuple):
     loss: float
     terms: dict[str, float]
     norms: dict[str, float]
-    """Of the gradients, by our names."""
+    """Norms of the gradients, by our names."""
     none: set[str]
     """Our parameters that have none there."""
 
     def compute(self) -> Loss:
-        """Our loss; its gradients are in the network."""
+        """Compute our loss; its gradients are in the network."""
         self.network.zero_grad(set_to_none=True)
         loss = OBJECTIVES[self.method](self.network, self.features, self.future, self.weights)
         loss.value.backward()
         return loss
 
     def gradients(self) -> dict[str, Tensor | None]:
-        """By our names."""
+        """Return our gradients by our names."""
         return {name: parameter.grad for name, parameter in self.network.named_parameters()}
 
     def ratios(self) -> NDArray[np.float64]:
-        """Norms of our gradients, by the reference's, in the order of ``norms``."""
+        """Return norms of our gradients, by the reference's, in the order of ``norms``."""
         self.compute()
         ours = self.gradients()
         return np.array(
@@ -119,7 +119,7 @@ class Golden(NamedTuple):
 
 @pytest.fixture(params=METHODS)
 def golden(shared: Path, request: pytest.FixtureRequest) -> Golden:
-    """Each method's."""
+    """Return the golden values of each method."""
     method, folder = str(request.param), shared / "reference/golden/losses"
     file = json.loads((folder / f"{method}.json").read_text())
     tensors = rename(load_file(folder / f"{method}.safetensors"))
@@ -146,7 +146,7 @@ def golden(shared: Path, request: pytest.FixtureRequest) -> Golden:
 
 @pytest.fixture
 def released(golden: Golden, monkeypatch: pytest.MonkeyPatch) -> Released:
-    """The released arithmetic in place of ours."""
+    """Put the released arithmetic in place of ours."""
     integrate = Released(golden.features["origin"])
     monkeypatch.setattr(network_module, "integrate_unicycle", integrate)
     return integrate

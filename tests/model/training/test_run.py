@@ -28,7 +28,7 @@ from tests.model.training.fakes import small_config
 
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
-    """A run over two made-up scenes."""
+    """Return a run over two made-up scenes."""
     reader = FixedReader(record(), record("scene-2", seed=1))
     monkeypatch.setitem(READERS, "made", lambda path: reader)
     source = Source("made", tmp_path, "some", "some", Protocol.CAUSAL)
@@ -36,7 +36,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
 
 
 def go(run: Run) -> tuple[Path, list[Progress]]:
-    """Runs it; where the checkpoint is, and each epoch's progress."""
+    """Run it; return the checkpoint's folder and each epoch's progress."""
     reports: list[Progress] = []
     folder = run.train(
         lambda progress, figures: reports.append(progress),

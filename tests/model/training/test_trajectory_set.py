@@ -1,4 +1,4 @@
-"""Covers of trajectories."""
+"""Sets that cover trajectories."""
 
 import numpy as np
 import pytest
@@ -20,14 +20,14 @@ PATHS = arrays.arrays(
 
 
 def greatest_distances(paths: Float32s) -> Float32s:
-    """[N, N], m."""
+    """Return the maximum distances [N, N], m."""
     offset = paths[:, None] - paths[None]
     distances: Float32s = np.hypot(offset[..., 0], offset[..., 1]).max(axis=-1)
     return distances
 
 
 def wandering(count: int, seed: int = 0) -> Float32s:
-    """Paths [count, 12, 2] that go on at some speed, more or less ahead."""
+    """Return paths [count, 12, 2] that go on at some speed, more or less ahead."""
     rng = np.random.default_rng(seed)
     steps = rng.uniform(0, 5, (count, 1, 1)) * np.array([1.0, 0.0]) + rng.normal(0, 0.3, (count, 12, 2))
     return np.cumsum(steps, axis=1).astype(np.float32)
