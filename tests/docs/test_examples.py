@@ -50,6 +50,16 @@ def test_the_example_of_the_client(server: Server, capsys: pytest.CaptureFixture
     assert "walker FALLBACK" in capsys.readouterr().out
 
 
+def test_the_example_of_the_benchmark(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    [code] = blocks(ROOT / "docs/benchmark.md", "python")
+    monkeypatch.chdir(tmp_path)
+    exec(code, {})  # noqa: S102
+    assert float(capsys.readouterr().out) > 0
+    assert {"results.json", "tables.md"} <= {file.name for file in (tmp_path / "runs/kalman").iterdir()}
+
+
 @pytest.mark.parametrize("page", PAGES, ids=name)
 def test_python_compiles(page: Path) -> None:
     for code in blocks(page, "python"):

@@ -1,5 +1,6 @@
 """What the documentation names exists: links, paths, make targets, commands, flags, settings, packages."""
 
+import importlib
 import re
 import tomllib
 from pathlib import Path
@@ -21,6 +22,7 @@ MAX_README_BYTES = 8_000
 MAX_PICTURE_BYTES = 150_000
 _FOLDERS = {folder.name for folder in ROOT.iterdir() if folder.is_dir() and not folder.name.startswith(".")}
 _PATH = re.compile(r"[\w.-]+(?:/[\w.*-]*)+")
+_MODULE = re.compile(r"(?:model|service|benchmark|loadtest|cab_forecast|cli|docs)(?:\.(?!yml|py|md)\w+)+")
 _FOREIGN_FLAGS = {"--build", "--profile", "--nproc-per-node"}
 """Flags of other programs."""
 
@@ -57,6 +59,16 @@ def test_paths_exist(page: Path) -> None:
     for span in spans(page):
         if _PATH.fullmatch(span) and span.split("/")[0] in _FOLDERS and not re.search(r"/[A-Z]+\b", span):
             assert list(ROOT.glob(span.rstrip("/"))), span
+
+
+@pages
+def test_modules_exist(page: Path) -> None:
+    for span in spans(page):
+        if _MODULE.fullmatch(span):
+            path = ROOT / span.replace(".", "/")
+            if not (path.is_dir() or path.with_suffix(".py").is_file()):
+                module, _, attribute = span.rpartition(".")
+                assert hasattr(importlib.import_module(module), attribute), span
 
 
 @pages
