@@ -22,7 +22,8 @@ class Stream(Iterator[_Message]):
     """
 
     def __init__(self, messages: Iterator[_Message], cancel: Callable[[], None]) -> None:
-        """
+        """Create a stream of a started call.
+
         Args:
             messages: blocks until the next message; raises ForecastError if the call fails.
             cancel: ends the call; may be called from any thread and repeatedly.
@@ -82,7 +83,8 @@ class AsyncStream(Generic[_Message]):
     """
 
     def __init__(self, start: Callable[[], Awaitable[OpenStream[_Message]]]) -> None:
-        """
+        """Create a stream; its call is not started yet.
+
         Args:
             start: starts the call; raises ForecastError if that fails.
         """

@@ -65,7 +65,8 @@ class StreamTimeouts(Mapping[str, float]):
     """httpx timeouts of a stream: the budget until it has started, then a fixed timeout for each read."""
 
     def __init__(self, budget: Budget, idle_timeout: float) -> None:
-        """
+        """Create the timeouts of one stream.
+
         Args:
             budget: the time for the start of the stream.
             idle_timeout: seconds without a byte after which the connection counts as lost.
@@ -85,7 +86,7 @@ class StreamTimeouts(Mapping[str, float]):
 
 
 class _Backoff(wait_base):
-    """Wait for the server's retry-after plus jitter; without one, exponential backoff with jitter."""
+    """Backoff by the server's retry-after, or exponential without one; both with jitter."""
 
     def __init__(self) -> None:
         self._exponential = wait_exponential_jitter(

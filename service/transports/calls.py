@@ -36,7 +36,7 @@ UNARY_METHODS: Mapping[Route[Any, Any], Callable[[DataPlane, Any], Awaitable[Mes
 
 
 class CallRecorder:
-    """Records how one call ended, in the metrics and in the debug log."""
+    """Recorder of how one call ended, for the metrics and the debug log."""
 
     def __init__(self, transport: str, method: str, call: Call) -> None:
         self._transport = transport

@@ -1,4 +1,4 @@
-"""Answers as a server would make them, from plain kinematics."""
+"""Responses as a server would send them, from plain kinematics."""
 
 import math
 
@@ -22,7 +22,7 @@ MODEL = ModelReference(name="fan", version="1.0.0", protocol=INPUT_PROTOCOL_CAUS
 
 
 def answer(request: PredictRequest) -> PredictResponse:
-    """A fan of constant turns from each agent's last two observations; one-state agents are INVALID."""
+    """Return a fan of constant turns from the last two observations; agents with one state are INVALID."""
     steps = round((request.options.horizon or 6.0) / STEP)
     return PredictResponse(
         forecasts=[_forecast(agent, steps, request.options.samples) for agent in request.agents],

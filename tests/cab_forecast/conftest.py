@@ -14,13 +14,13 @@ Call = Callable[..., Any]
 
 @pytest.fixture
 def script() -> Script:
-    """What the fake server does."""
+    """Provide the script of the fake server."""
     return Script()
 
 
 @pytest.fixture(params=["grpc", "http", "http-json"])
 def server(request: pytest.FixtureRequest, script: Script) -> Iterator[tuple[str, dict[str, Any]]]:
-    """A fake server; yields its endpoint and what a client needs besides."""
+    """Run a fake server; yield its endpoint and the other client arguments."""
     fake = grpc_fake if request.param == "grpc" else http_fake
     with fake(script) as address:
         scheme = "grpc" if request.param == "grpc" else "http"

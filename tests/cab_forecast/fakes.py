@@ -1,4 +1,4 @@
-"""Fakes of the server's side: they answer, or fail as the contract's error table says, on real sockets."""
+"""Fake servers on real sockets, which respond or fail as the contract's error table says."""
 
 import json
 import socket
@@ -83,7 +83,7 @@ class Failure(Exception):  # noqa: N818
 
 @dataclass(eq=False)
 class Raw(Exception):  # noqa: N818
-    """An HTTP answer that is not of the contract, such as a gateway's."""
+    """An HTTP response outside the contract, such as a gateway's."""
 
     status: int
     body: bytes
@@ -92,7 +92,7 @@ class Raw(Exception):  # noqa: N818
 
 @dataclass
 class Script:
-    """What the fake does: fails as told, call by call, then answers."""
+    """Script of a fake server: the given failures, call by call, then responses."""
 
     failures: list[Failure | Raw] = field(default_factory=list)
     held: threading.Event | None = None
@@ -104,7 +104,7 @@ class Script:
     predicted: list[PredictRequest] = field(default_factory=list)
 
     def play(self, headers: Mapping[str, str]) -> None:
-        """One call: records it, and raises what the script says."""
+        """Record one call, and raise the failure in the script."""
         self.calls.append(headers)
         self.times.append(time.monotonic())
         if self.held is not None:
@@ -151,7 +151,7 @@ class _GrpcFake(PredictionServiceServicer, ModelServiceServicer):
 def grpc_fake(
     script: Script, credentials: grpc.ServerCredentials | None = None, port: int = 0
 ) -> Iterator[str]:
-    """A gRPC server that plays the script; yields ``host:port``."""
+    """Run a gRPC server that follows the script; yield ``host:port``."""
     server = grpc.server(ThreadPoolExecutor(4))
     fake = _GrpcFake(script)
     add_PredictionServiceServicer_to_server(fake, server)
@@ -220,7 +220,7 @@ class _HttpFake:
 def http_fake(
     script: Script, port: int = 0, ssl_keyfile: str | None = None, ssl_certfile: str | None = None
 ) -> Iterator[str]:
-    """An HTTP server that plays the script; yields ``host:port``."""
+    """Run an HTTP server that follows the script; yield ``host:port``."""
     config = uvicorn.Config(
         _HttpFake(script),
         loop="asyncio",
@@ -246,7 +246,7 @@ def http_fake(
 
 @contextmanager
 def trickling_server() -> Iterator[str]:
-    """An HTTP server that answers at once, and then sends the body byte by byte; yields ``host:port``."""
+    """Run an HTTP server that responds at once, then sends the body byte by byte; yield ``host:port``."""
     head = f"HTTP/1.1 200 OK\r\ncontent-type: {PROTOBUF}\r\ncontent-length: 400\r\n\r\n"
     with raw_server(head.encode(), b"\0") as address:
         yield address
@@ -254,11 +254,11 @@ def trickling_server() -> Iterator[str]:
 
 @contextmanager
 def raw_server(head: bytes, drip: bytes | None) -> Iterator[str]:
-    """A server of one connection; yields ``host:port``.
+    """Run a server for one connection; yield ``host:port``.
 
     Args:
-        head: what it says to whatever comes first.
-        drip: what it says again and again from then on; None: it hangs up.
+        head: bytes sent once the client has connected and sent something.
+        drip: bytes sent repeatedly after the head; None: the server closes the connection.
     """
     over = threading.Event()
 
@@ -281,6 +281,6 @@ def raw_server(head: bytes, drip: bytes | None) -> Iterator[str]:
 
 
 def free_port() -> int:
-    """A port on which nobody listens."""
+    """Return a port without a listener."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         return int(listener.getsockname()[1])

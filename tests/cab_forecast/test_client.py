@@ -347,7 +347,7 @@ def test_tls_with_an_own_certificate(
 
 @pytest.fixture(scope="module")
 def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Key and self-signed certificate for localhost, made on the spot."""
+    """Create a key and a self-signed certificate for localhost."""
     folder = tmp_path_factory.mktemp("tls")
     key, chain = folder / "key.pem", folder / "chain.pem"
     command = [

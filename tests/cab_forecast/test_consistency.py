@@ -1,4 +1,4 @@
-"""The client's calls about consistency, to the real server with a plane that says what the tests want."""
+"""Consistency calls of the client, to the real server with a scripted consistency service."""
 
 import asyncio
 import threading
@@ -35,7 +35,7 @@ SSE_HEAD = b"HTTP/1.1 200 OK\r\ncontent-type: text/event-stream\r\ntransfer-enco
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """The server with its baselines."""
+    """Run a server with the baselines."""
     models = tmp_path_factory.mktemp("models")
     with in_thread(settings(models=models, api_tokens=(SecretStr(TOKEN),))) as running:
         yield running
@@ -48,7 +48,7 @@ def plane(server: Server) -> FakePlane:
 
 @pytest.fixture(params=["grpc", "http", "http-json"])
 def arguments(request: pytest.FixtureRequest, server: Server) -> dict[str, Any]:
-    """Arguments of a client that reaches it."""
+    """Return the arguments of a client for that server."""
     if request.param == "grpc":
         return {"endpoint": f"grpc://{server.grpc_address}", "token": TOKEN}
     encoding = "json" if request.param == "http-json" else "protobuf"

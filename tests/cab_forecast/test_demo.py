@@ -1,4 +1,4 @@
-"""The demo's scene is possible, and always the same."""
+"""The demo scene: physically possible and deterministic."""
 
 import math
 import subprocess

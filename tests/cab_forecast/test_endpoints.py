@@ -1,4 +1,4 @@
-"""Reading endpoints."""
+"""Parsing of endpoints."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Server-Sent Events to messages."""
+"""Parsing of Server-Sent Events."""
 
 import pytest
 from hypothesis import given

@@ -10,7 +10,7 @@ STEP = 0.5
 
 
 def path(speeds: list[float], turn: float = 0.0, start: float = 0.0) -> np.ndarray:
-    """Twelve steps at speeds that change evenly, turning so many degrees in all."""
+    """Return twelve steps with linearly changing speed and a total turn in degrees."""
     speed = np.interp(np.linspace(0, len(speeds) - 1, 12), range(len(speeds)), speeds)
     angles = start + math.radians(turn) * np.arange(1, 13) / 12
     return np.cumsum(STEP * speed[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=-1), axis=0)

@@ -1,4 +1,4 @@
-"""The picture."""
+"""Plots of scenes and forecasts."""
 
 import importlib
 import sys
@@ -16,7 +16,7 @@ from tests.cab_forecast.answers import answer
 
 
 def drawn(request: PredictRequest, folder: Path) -> np.ndarray:
-    """Pixels of the picture, [height, width, 3]."""
+    """Return the pixels of the plot: [height, width, 3]."""
     path = folder / "picture.png"
     plot(request, answer(request), path)
     return np.asarray(Image.open(path).convert("RGB"))
@@ -37,7 +37,7 @@ def test_draws_the_demo(tmp_path: Path) -> None:
 
 
 def test_draws_odd_scenes(tmp_path: Path) -> None:
-    """Far agents, standing ones, invalid ones, patches of their own, no map, many of them."""
+    """Far, standing and invalid agents, own patches, no map, many agents."""
     patch = map_patch(np.ones((3, 100, 100)))
     odd = [
         agent("still", "vehicle", [-0.5, 0.0], [[5, 5], [5, 5]], map_patch=patch),

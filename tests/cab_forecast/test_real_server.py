@@ -31,7 +31,7 @@ MODEL = "constant-velocity-yaw"
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """The server with its baselines."""
+    """Run a server with the baselines."""
     settings = Settings(
         http="127.0.0.1:0",
         grpc="127.0.0.1:0",
@@ -46,7 +46,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 @pytest.fixture(params=["grpc", "http", "http-json"])
 def arguments(request: pytest.FixtureRequest, server: Server) -> dict[str, Any]:
-    """Arguments of a client that reaches it."""
+    """Return the arguments of a client for that server."""
     if request.param == "grpc":
         return {"endpoint": f"grpc://{server.grpc_address}", "token": TOKEN}
     encoding = "json" if request.param == "http-json" else "protobuf"

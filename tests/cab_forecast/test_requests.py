@@ -1,4 +1,4 @@
-"""Requests from arrays, and map layers to bytes and back."""
+"""Builders of requests, and encoding of map layers."""
 
 import hypothesis.extra.numpy as arrays
 import numpy as np
@@ -90,7 +90,7 @@ def test_layers_round_trip(layers: Layers) -> None:
 
 
 def test_bits_are_in_the_contracts_order() -> None:
-    """[layer, row, column], eight a byte, the first in the highest bit, the last byte filled with zeros."""
+    """Order [layer, row, column], eight per byte, first in the highest bit, zeros at the end."""
     layers = np.zeros((3, 2, 2))
     layers[0, 0, 0] = layers[0, 1, 0] = layers[2, 1, 1] = 1
     assert encode_layers(layers).packed_bits == bytes([0b10100000, 0b00010000])

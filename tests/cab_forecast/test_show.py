@@ -1,4 +1,4 @@
-"""The table."""
+"""Forecasts as a table."""
 
 import io
 import re
@@ -22,7 +22,7 @@ from tests.cab_forecast.answers import answer
 
 
 def shown(response: PredictResponse, request: PredictRequest | None = None, width: int | None = None) -> str:
-    """What is printed; a width makes it a terminal's."""
+    """Return the printed text; with a width, as on a terminal."""
     file = io.StringIO()
     print_forecasts(
         response, request, Console(file=file, width=width, force_terminal=width is not None, no_color=True)
@@ -78,7 +78,7 @@ def test_an_agent_that_looks_nowhere_has_no_ahead() -> None:
 @settings(deadline=None)
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=6).filter(lambda drawn: sum(drawn) > 0.01), st.data())
 def test_percents_sum_to_a_hundred(drawn: list[float], data: st.DataObject) -> None:
-    """Whatever part of the modes was returned."""
+    """The sum does not depend on the share of returned modes."""
     request = demo_request()
     del request.agents[1:]
     response = answer(request)

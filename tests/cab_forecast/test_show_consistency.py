@@ -38,7 +38,7 @@ SUMS = pb.ModelConsistency(
 
 
 def shown(show: Callable[..., None], what: Any) -> list[str]:
-    """The lines that are printed."""
+    """Return the printed lines."""
     file = io.StringIO()
     show(what, console=Console(file=file))
     return file.getvalue().splitlines()

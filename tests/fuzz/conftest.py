@@ -1,4 +1,4 @@
-"""A server with every kind of model, in a thread of its own, for generated requests."""
+"""Server with every kind of model, in its own thread, for generated requests."""
 
 import asyncio
 import threading
@@ -15,13 +15,13 @@ from tests.service.servers import settings
 
 @pytest.fixture(scope="session")
 def server() -> Iterator[Server]:
-    """Physics, Kalman and a CAB network of seeded random weights, the default."""
+    """Run a server with physics, Kalman and, as the default, a CAB network with seeded random weights."""
     started = threading.Event()
     loop = asyncio.new_event_loop()
     box: list[Server] = []
 
     async def start() -> None:
-        # Bounds small enough that generated requests meet them
+        # Limits small enough for generated requests to reach
         limits = {"max_agents": 4, "max_states": 6, "max_raster_pixels": 3000, "default_model": "cab"}
         box.append(Server(settings(**limits), load=registry))
         await box[0].start()
@@ -43,11 +43,11 @@ def server() -> Iterator[Server]:
 
 
 def registry() -> Registry:
-    """All kinds of models."""
+    """Return a registry with every kind of model."""
     return Registry([*physics.baselines(), kalman.Kalman(), cab_network()])
 
 
 @pytest.fixture(scope="session")
 def model_names() -> list[str]:
-    """Their names; empty is the default."""
+    """Return the names of the models; an empty name is the default."""
     return ["", "", *[info.name for info in registry().infos()], "cab"]

@@ -1,4 +1,4 @@
-"""Requests of all kinds: good ones, and good ones with something wrong anywhere in the message."""
+"""Strategies for requests: valid ones, and valid ones with faults anywhere in the message."""
 
 import math
 
@@ -34,7 +34,7 @@ NASTY = {
 
 @st.composite
 def histories(draw: st.DrawFn, now: float) -> list[pb.AgentState]:
-    """A plausible history."""
+    """Generate a plausible history."""
     count, step = draw(st.integers(1, 6)), draw(st.sampled_from([0.1, 0.25, 0.5]))
     age = draw(st.sampled_from([0.0, 0.04, 0.3]))
     x, y = draw(st.floats(-60, 60)), draw(st.floats(-60, 60))
@@ -57,14 +57,14 @@ def histories(draw: st.DrawFn, now: float) -> list[pb.AgentState]:
 
 
 def images(rows: int, columns: int) -> st.SearchStrategy[pb.LayerImage]:
-    """Striped layers."""
+    """Generate striped map layers."""
     size = (3 * rows * columns + 7) // 8
     return st.integers(0, 255).map(lambda b: pb.LayerImage(packed_bits=bytes([b]) * (size - 1) + b"\x00"))
 
 
 @st.composite
 def agents(draw: st.DrawFn, now: float, index: int) -> pb.Agent:
-    """An agent."""
+    """Generate an agent."""
     kind = draw(st.sampled_from([1, 1, 1, 2, 3, 4]))
     agent = pb.Agent(id=f"agent-{index}", type=kind, states=draw(histories(now)))  # type: ignore[arg-type]
     if draw(st.sampled_from([False, False, True])):
@@ -78,7 +78,7 @@ def agents(draw: st.DrawFn, now: float, index: int) -> pb.Agent:
 
 @st.composite
 def rasters(draw: st.DrawFn) -> pb.SceneRaster:
-    """A scene raster."""
+    """Generate a scene raster."""
     rows, columns = draw(st.integers(1, 54)), draw(st.integers(1, 54))
     return pb.SceneRaster(
         image=draw(images(rows, columns)),
@@ -92,7 +92,7 @@ def rasters(draw: st.DrawFn) -> pb.SceneRaster:
 
 @st.composite
 def options(draw: st.DrawFn) -> pb.PredictOptions:
-    """Options."""
+    """Generate options."""
     result = pb.PredictOptions(
         max_modes=draw(st.sampled_from([0, 1, 5, 25, 26])),
         samples=draw(st.sampled_from([0, 0, 1, 20])),
@@ -109,7 +109,7 @@ def options(draw: st.DrawFn) -> pb.PredictOptions:
 
 @st.composite
 def good_requests(draw: st.DrawFn, model_names: list[str]) -> pb.PredictRequest:
-    """Requests with nothing wrong but what agents may lack."""
+    """Generate requests that are valid, apart from what agents may lack."""
     now = draw(st.sampled_from([0.0, 12.5, 1_700_000_000.25]))
     result = pb.PredictRequest(
         time=now,
@@ -125,7 +125,7 @@ def good_requests(draw: st.DrawFn, model_names: list[str]) -> pb.PredictRequest:
 
 @st.composite
 def requests(draw: st.DrawFn, model_names: list[str]) -> pb.PredictRequest:
-    """Good requests, with up to three things wrong."""
+    """Generate valid requests with up to three faults."""
     request = draw(good_requests(model_names))
     for _ in range(draw(st.sampled_from([0, 0, 1, 1, 2, 3]))):
         spoil(draw, request)
@@ -133,7 +133,7 @@ def requests(draw: st.DrawFn, model_names: list[str]) -> pb.PredictRequest:
 
 
 def spoil(draw: st.DrawFn, message: Message) -> None:
-    """Changes one thing somewhere in a message."""
+    """Change one value somewhere in a message."""
     nested: list[Message] = []
     for present, value in message.ListFields():
         if present.cpp_type == FieldDescriptor.CPPTYPE_MESSAGE:
@@ -165,12 +165,12 @@ def spoil(draw: st.DrawFn, message: Message) -> None:
 
 
 def model_requests(model_names: list[str]) -> st.SearchStrategy[models.GetModelRequest]:
-    """Requests for one model."""
+    """Generate requests for one model."""
     return st.one_of(st.sampled_from(model_names), NASTY_TEXT).map(lambda n: models.GetModelRequest(name=n))
 
 
 def consistency_requests() -> st.SearchStrategy[Message]:
-    """Requests about scenes and agents, known and unknown."""
+    """Generate requests about scenes and agents, known and unknown."""
     return st.one_of(
         st.builds(
             consistency.GetAgentConsistencyRequest, scene_id=NAMES, agent_id=NAMES, window=NASTY_FLOATS
@@ -181,5 +181,5 @@ def consistency_requests() -> st.SearchStrategy[Message]:
 
 
 def watch_requests() -> st.SearchStrategy[consistency.WatchSceneRequest]:
-    """Requests to watch a scene."""
+    """Generate requests to watch a scene."""
     return st.builds(consistency.WatchSceneRequest, scene_id=NAMES)

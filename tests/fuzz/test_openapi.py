@@ -1,4 +1,4 @@
-"""Generated requests from the OpenAPI document, and answers checked against it."""
+"""Requests generated from the OpenAPI document, with responses checked against it."""
 
 import math
 from typing import Any
@@ -24,7 +24,7 @@ pytestmark = [
 
 
 CASES = settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
-"""For each operation. Plain hypothesis instead of schemathesis's pytest plugin, which pytest 9.2 breaks."""
+"""Settings for each operation. Plain hypothesis replaces schemathesis's plugin, which pytest 9.2 breaks."""
 
 EVENTS = "GET /v1/consistency/events"
 
@@ -56,8 +56,8 @@ def test_every_operation(server: Server) -> None:
 
 
 def check(case: Any) -> None:
-    """Sends a case and checks the answer."""
-    if case.operation.label == EVENTS:  # or they would have no end
+    """Send a case and check the response."""
+    if case.operation.label == EVENTS:  # otherwise the stream would not end
         case.headers["Request-Timeout"] = "0.01"
     response = case.call()
     case.validate_response(
@@ -71,7 +71,7 @@ def check(case: Any) -> None:
 
 
 def finite(value: object) -> bool:
-    """Whether no number in a document is NaN or infinite (nor such a string, as protobuf writes them)."""
+    """Return whether a document has no NaN or infinity, as a number or as protobuf's string."""
     if isinstance(value, dict):
         return all(map(finite, value.values()))
     if isinstance(value, list):

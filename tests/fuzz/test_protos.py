@@ -1,4 +1,4 @@
-"""Generated messages to a running server: any answer is right but an internal error or a wrong number."""
+"""Generated messages to a running server, which must never cause internal errors or wrong numbers."""
 
 import math
 from collections import Counter
@@ -49,7 +49,7 @@ PROTOBUF = {"content-type": "application/x-protobuf", "accept": "application/x-p
 
 
 def damaged(request: pb.PredictRequest) -> st.SearchStrategy[bytes]:
-    """A message with one byte changed, or cut off."""
+    """Generate a message with one byte changed, or truncated."""
     good = request.SerializeToString()
     if not good:
         return st.just(b"")
@@ -62,21 +62,21 @@ def damaged(request: pb.PredictRequest) -> st.SearchStrategy[bytes]:
 
 @pytest.fixture(scope="module")
 def channel(server: Server) -> Iterator[grpc.Channel]:
-    """A channel to the server."""
+    """Open a channel to the server."""
     with grpc.insecure_channel(server.grpc_address) as channel:
         yield channel
 
 
 @pytest.fixture(scope="module")
 def http(server: Server) -> Iterator[httpx.Client]:
-    """A client of the server."""
+    """Open an HTTP client of the server."""
     with httpx.Client(base_url=f"http://{server.http_address}", timeout=30) as client:
         yield client
 
 
 @pytest.fixture(scope="module")
 def seen() -> Iterator[Counter[str]]:
-    """How calls ended; a fuzz run whose requests are all refused tests little."""
+    """Count how calls ended; a run whose requests are all refused tests little."""
     counts: Counter[str] = Counter()
     yield counts
     assert counts["OK"] > 0.4 * counts.total(), counts
@@ -166,14 +166,14 @@ def test_watching(channel: grpc.Channel, request: consistency_pb.WatchSceneReque
 
 
 def expected_code(error: grpc.RpcError) -> str:
-    """Name of the error's code, which is one that a request can be at fault for."""
+    """Return the code of the error, after checking that a request can cause it."""
     code: grpc.StatusCode = error.code()
     assert code in EXPECTED, error
     return code.name
 
 
 def check(request: pb.PredictRequest, response: pb.PredictResponse) -> None:
-    """What must hold of every answer."""
+    """Check what must hold for every response."""
     steps = response.steps
     forecasts = response.forecasts
     wanted = {n for n, agent in enumerate(request.agents) if not agent.HasField("predict") or agent.predict}

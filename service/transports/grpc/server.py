@@ -34,7 +34,7 @@ _OPEN = ("/grpc.health.v1.Health/",)
 
 
 class GrpcServer:
-    """The gRPC server of one pipeline."""
+    """The gRPC server, with the contract's services, health and reflection."""
 
     def __init__(self, dataplane: DataPlane, metrics: Metrics, settings: Settings) -> None:
         self._settings = settings

@@ -157,7 +157,8 @@ class EventStreamResponse(Response):
         request: Request,
         events: Callable[[], AsyncIterator[Message]],
     ) -> None:
-        """
+        """Create the response; the call starts when it is served.
+
         Args:
             metrics: records the call.
             tokens: authenticate it.

@@ -21,13 +21,13 @@ ASKED = GetAgentConsistencyRequest(scene_id="s", agent_id="a")
 
 @pytest.fixture(params=TRANSPORTS)
 def call(request: pytest.FixtureRequest) -> Call:
-    """Predict over one of the transports."""
+    """Return Predict over one of the transports."""
     return TRANSPORTS[request.param]
 
 
 @pytest.fixture(params=GET_AGENT_BY)
 def get_agent(request: pytest.FixtureRequest) -> Call:
-    """GetAgentConsistency over one of the transports."""
+    """Return GetAgentConsistency over one of the transports."""
     return GET_AGENT_BY[request.param]
 
 

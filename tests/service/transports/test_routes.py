@@ -1,4 +1,4 @@
-"""The route table says what the contract says, and all that read it follow."""
+"""The route table: consistency with the contract, and with the code that reads it."""
 
 import pytest
 

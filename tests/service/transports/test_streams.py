@@ -1,4 +1,4 @@
-"""Streams of events as transports need them."""
+"""Streamed responses with idle ticks."""
 
 import asyncio
 from collections.abc import AsyncGenerator
@@ -10,7 +10,7 @@ from service.transports.streams import with_idle_ticks
 
 
 class Source:
-    """Gives what is put into it; knows whether it was closed."""
+    """Source of events from a queue that records whether it was closed."""
 
     def __init__(self) -> None:
         self.queue: asyncio.Queue[int | Exception | None] = asyncio.Queue()

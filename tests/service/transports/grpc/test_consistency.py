@@ -37,7 +37,7 @@ async def stub(server: Server) -> AsyncIterator[Any]:
 
 
 async def failure(call: Any) -> CallError:
-    """The error that a stream ends with."""
+    """Return the error that a stream ends with."""
     with pytest.raises(grpc.aio.AioRpcError) as caught:
         [_ async for _ in call]
     return from_grpc(caught.value)

@@ -1,4 +1,4 @@
-"""What gRPC has besides predicting: health, reflection, the models, limits."""
+"""gRPC besides Predict: health, reflection, models, limits."""
 
 from collections.abc import AsyncIterator
 

@@ -1,4 +1,4 @@
-"""JSON: what is read and written is protobuf's mapping, and nothing that is sent does harm."""
+"""JSON codec: protobuf's mapping in both directions, and robustness against any input."""
 
 import math
 from contextlib import suppress
@@ -41,7 +41,7 @@ def scalars(field: FieldDescriptor) -> "st.SearchStrategy[Any]":
 
 @st.composite
 def messages(draw: st.DrawFn, descriptor: Any) -> Message:
-    """Any message of a type."""
+    """Generate any message of a type."""
     message = GetMessageClass(descriptor)()
     for field in descriptor.fields:
         if not draw(st.booleans()):

@@ -96,7 +96,7 @@ async def test_gets(
     ],
 )
 async def test_bad_parameters_are_named(client: httpx.AsyncClient, address: str, field: str) -> None:
-    """By the server's own plane: the values are its to judge."""
+    """The server's own consistency service validates the values."""
     error = from_problem(await client.get(address))
     assert (error.http_status, error.reason) == (422, "BAD_FIELD")
     assert [name for name, _ in error.faults] == [field]
@@ -135,14 +135,14 @@ async def test_resets_that_are_none(
 
 
 class Reader:
-    """Server-Sent Events as text, one after the other."""
+    """Reader of Server-Sent Events as text."""
 
     def __init__(self, response: httpx.Response) -> None:
         self._chunks = response.aiter_text()
         self._text = ""
 
     async def read(self) -> str:
-        """The next event or comment; "" at the end."""
+        """Return the next event or comment; "" at the end."""
         async with asyncio.timeout(10):
             while "\n\n" not in self._text:
                 try:

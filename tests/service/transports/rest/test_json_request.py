@@ -1,4 +1,4 @@
-"""Requests as JSON: what is too large is refused unread, all else is read as protobuf reads it."""
+"""Predict requests as JSON: size limits apply before parsing, and the result equals protobuf's."""
 
 import functools
 from collections.abc import Callable
@@ -128,7 +128,7 @@ agents = st.fixed_dictionaries(
 
 
 def outcome(read: Callable[[bytes], pb.PredictRequest], body: bytes) -> object:
-    """The request as a text, as NaN is not equal to itself; or the faults."""
+    """Return the request as text, because NaN is not equal to itself, or the faults."""
     try:
         return str(read(body))
     except BadField as error:

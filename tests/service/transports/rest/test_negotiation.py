@@ -1,4 +1,4 @@
-"""Headers: what they ask for, and what is refused."""
+"""Content negotiation by headers."""
 
 import pytest
 from starlette.datastructures import Headers

@@ -1,4 +1,4 @@
-"""The OpenAPI document: true to the contract, and its examples work."""
+"""The OpenAPI document: consistency with the contract, and working examples."""
 
 from typing import Any
 

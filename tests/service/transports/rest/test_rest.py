@@ -1,4 +1,4 @@
-"""REST as HTTP: addresses, media types, headers, limits."""
+"""HTTP side of REST: paths, media types, headers, limits."""
 
 import re
 from collections.abc import AsyncIterator
