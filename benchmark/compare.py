@@ -156,7 +156,7 @@ def table(comparison: Comparison) -> Table:
     rows = tuple(_row(model, one) for model in comparison.models for one in model.differences)
     note = (
         "B − A; in a paired comparison, the mean over the pairs of both runs, with its standard error as if "
-        f"pairs were independent, and its {LEVEL:.0%} interval by bootstrap over scenes ({RESAMPLES} "
+        f"pairs were independent, and its {100 * LEVEL:g} % interval by bootstrap over scenes ({RESAMPLES} "
         f"resamples, seed {SEED}; none for fewer than two scenes, or if neither run recorded them). Clear: "
         f"more than {CLEAR:g} standard errors, and an interval without 0."
     )

@@ -29,7 +29,7 @@ NAMES = (
     "constant-velocity-yaw",
     "kalman",
 )
-"""Of all models that an endpoint serves."""
+"""Names of all models that an endpoint serves."""
 LATENCY = Latency(
     calls=40,
     p50_s=0.0123,

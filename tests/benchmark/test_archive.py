@@ -43,7 +43,7 @@ def test_an_answer_is_there_without_closing(tmp_path: Path) -> None:
     first.close()
 
 
-def test_answers_belong_to_what_was_asked(tmp_path: Path) -> None:
+def test_answers_belong_to_one_run(tmp_path: Path) -> None:
     facts = {"split": "train_val", "plan": "1234"}
     with Archive(tmp_path) as archive:
         archive.bind(facts)

@@ -1,4 +1,4 @@
-"""Which models of an endpoint are judged."""
+"""Selection of the models of an endpoint."""
 
 import pytest
 
@@ -42,19 +42,19 @@ def test_a_name_is_its_newest_version_of_the_protocol() -> None:
     assert list(select(LISTED, Protocol.PAPER, ["cab"])) == ["cab@1.0.0+paper"]
 
 
-def test_who_is_named_is_judged_whatever_its_protocol() -> None:
+def test_a_named_model_is_selected_whatever_its_protocol() -> None:
     assert list(select(LISTED, Protocol.CAUSAL, ["trajectron"])) == ["trajectron@1.0.0"]
     assert list(select(LISTED, Protocol.PAPER, ["cab@1.0.0"])) == ["cab@1.0.0"]
 
 
-def test_who_is_not_there_is_said() -> None:
+def test_a_missing_model_is_named() -> None:
     with pytest.raises(BenchmarkError, match=r"no model 'fan'; it has cab@1\.0\.0, cab@1\.0\.0"):
         select(LISTED, Protocol.CAUSAL, ["fan"])
     with pytest.raises(BenchmarkError, match="the endpoint has no model of the causal protocol"):
         select([model("trajectron", paper=True)], Protocol.CAUSAL)
 
 
-def test_who_forecasts_no_vehicles_is_judged_if_named_alone() -> None:
+def test_a_model_without_vehicles_is_selected_only_if_named() -> None:
     walker = model("walker")
     walker.ClearField("agent_types")
     walker.agent_types.append(AGENT_TYPE_PEDESTRIAN)
@@ -62,7 +62,7 @@ def test_who_forecasts_no_vehicles_is_judged_if_named_alone() -> None:
     assert list(select([*LISTED, walker], Protocol.CAUSAL, ["walker"])) == ["walker@1.0.0"]
 
 
-def test_who_does_not_forecast_far_enough_is_named_before_anything_is_asked() -> None:
+def test_a_short_horizon_is_refused_before_any_request() -> None:
     short = model("short")
     short.horizon = 4.0
     with pytest.raises(BenchmarkError, match=r"short@1\.0\.0: forecasts less than 6 s"):

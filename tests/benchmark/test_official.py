@@ -54,13 +54,13 @@ VERSION = "v1.0-mini"
 
 
 @dataclass(frozen=True)
-class Asked:
-    """A split and what a server said about it."""
+class Answered:
+    """A split with the answers of a server."""
 
     dataroot: Path
     scenes: Sequence[PlannedScene]
     answers: Mapping[str, Sequence[SceneAnswers]]
-    """By the models' names, of each scene."""
+    """Answers about each scene, by the models' names."""
 
     def entries(self, model: str) -> list[Entry]:
         """The submission."""
@@ -79,13 +79,13 @@ class Asked:
             for theirs, ours in OURS.items()
         }
 
-    def likeliest(self, model: str) -> Floats:
+    def most_likely(self, model: str) -> Floats:
         """[N, 12, 2], m, ground frame, of all pairs."""
         mixtures = [answers.mixture for answers in self.answers[model]]
         return np.concatenate([one.most_likely_trajectory().numpy() for one in mixtures if one is not None])
 
 
-def ask(dataroot: Path, split: str, folder: Path, models: Sequence[str]) -> Asked:
+def ask(dataroot: Path, split: str, folder: Path, models: Sequence[str]) -> Answered:
     """Answers of a server that runs for as long."""
 
     async def replay() -> dict[str, list[SceneAnswers]]:
@@ -103,11 +103,11 @@ def ask(dataroot: Path, split: str, folder: Path, models: Sequence[str]) -> Aske
                 }
 
     scenes = list(plan_scenes(NuscenesReader(dataroot), split, consistency=False))
-    return Asked(dataroot, scenes, asyncio.run(replay()))
+    return Answered(dataroot, scenes, asyncio.run(replay()))
 
 
 @pytest.fixture(scope="module", params=["made", "real"])
-def asked(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Asked:
+def answered(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Answered:
     """Three pairs of a made scene, or the 61 of mini_val."""
     folder = tmp_path_factory.mktemp(request.param)
     if request.param == "real":
@@ -150,30 +150,30 @@ def _assert_same(found: Mapping[str, Sequence[float]], expected: Mapping[str, Se
 
 
 @pytest.mark.parametrize("model", [LEARNED, SINGLE])
-def test_the_evaluator_finds_our_figures(asked: Asked, model: str) -> None:
-    entries, ours = asked.entries(model), asked.figures(model)
-    assert len(entries) == sum(len(scene.pairs) for scene in asked.scenes)
+def test_the_evaluator_finds_our_figures(answered: Answered, model: str) -> None:
+    entries, ours = answered.entries(model), answered.figures(model)
+    assert len(entries) == sum(len(scene.pairs) for scene in answered.scenes)
     assert {len(entry["probabilities"]) for entry in entries} == {25 if model == LEARNED else 1}
     if model == LEARNED and len(entries) > 3:
         assert ours["MinADEK"][0] > ours["MinADEK"][2]  # k does matter
-    _assert_same(_official(_helper(asked.dataroot), entries), ours)
+    _assert_same(_official(_helper(answered.dataroot), entries), ours)
 
 
-def test_the_official_command(asked: Asked, tmp_path: Path) -> None:
+def test_the_official_command(answered: Answered, tmp_path: Path) -> None:
     submission = tmp_path / "submission.json"
-    write_submission(asked.entries(LEARNED), submission)
+    write_submission(answered.entries(LEARNED), submission)
     command = [sys.executable, "-m", "nuscenes.eval.prediction.compute_metrics", "--version", VERSION]
-    command += ["--data_root", str(asked.dataroot), "--submission_path", str(submission)]
+    command += ["--data_root", str(answered.dataroot), "--submission_path", str(submission)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
     assert done.returncode == 0, done.stderr
     found = json.loads((tmp_path / "submission_metrics.json").read_text())
     figures = {name: means["RowMean"] for name, means in found.items()}
     assert figures.keys() == {*OURS, "OffRoadRate"}
-    _assert_same(figures, asked.figures(LEARNED))
+    _assert_same(figures, answered.figures(LEARNED))
     # Its map is finer than ours, and has no lanes
     rates = [
         off_road_rate_devkit(scene.record.raster, modes)
-        for scene, answers in zip(asked.scenes, asked.answers[LEARNED], strict=True)
+        for scene, answers in zip(answered.scenes, answered.answers[LEARNED], strict=True)
         if answers.mixture is not None
         for modes in answers.mixture.world_means.numpy()
     ]
@@ -182,15 +182,15 @@ def test_the_official_command(asked: Asked, tmp_path: Path) -> None:
 
 def test_the_physics_oracle(shared: Path, tmp_path: Path) -> None:
     """Ours is the devkit's within 1 %, whose speeds are of recorded times where ours are of nominal ones."""
-    asked = ask(shared / "data/nuscenes", "mini_train", tmp_path, PHYSICS)
-    helper = _helper(asked.dataroot)
+    answered = ask(shared / "data/nuscenes", "mini_train", tmp_path, PHYSICS)
+    helper = _helper(answered.dataroot)
     oracle = import_module("nuscenes.prediction.models.physics").PhysicsOracle(6, helper)
-    tokens = [pair.token for scene in asked.scenes for pair in scene.pairs]
+    tokens = [pair.token for scene in answered.scenes for pair in scene.pairs]
     official = _official(helper, [oracle(token).serialize() for token in tokens])
     theirs = np.array([official["MinADEK"][0], official["MinFDEK"][0]])
     np.testing.assert_allclose(theirs, [3.935, 9.266], rtol=0, atol=0.0005)  # of 742 pairs
-    four = np.stack([asked.likeliest(model) for model in PHYSICS], axis=1)
-    truth = np.concatenate([scene.truth() for scene in asked.scenes])
+    four = np.stack([answered.most_likely(model) for model in PHYSICS], axis=1)
+    truth = np.concatenate([scene.truth() for scene in answered.scenes])
     for criterion in Criterion:
         errors_m = displacement_m(physics_oracle(four, truth, criterion).trajectory, truth)
         np.testing.assert_allclose([errors_m.mean(), errors_m[:, -1].mean()], theirs, rtol=0.01)

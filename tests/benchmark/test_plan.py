@@ -1,4 +1,4 @@
-"""What is asked: every pair, every full history, each once."""
+"""Plans: every pair and every full history is requested once."""
 
 from dataclasses import replace
 
@@ -23,9 +23,9 @@ def test_every_pair_is_due_once() -> None:
         assert all(call.due <= set(call.tracks) for call in scene.calls)
 
 
-def test_every_full_history_of_the_challenges_agents_is_asked() -> None:
+def test_every_full_history_of_the_challenges_agents_is_requested() -> None:
     (scene, _) = planned()
-    asked = {(track, call.frame) for call in scene.calls for track in call.tracks}
+    requested = {(track, call.frame) for call in scene.calls for track in call.tracks}
     for index, track in enumerate(scene.record.tracks):
         frames = set(track.frames.tolist())
         for frame in frames:
@@ -33,11 +33,11 @@ def test_every_full_history_of_the_challenges_agents_is_asked() -> None:
             wanted = (full and track.id != "a4") or (index, frame) in {
                 (pair.track, pair.frame) for pair in scene.pairs
             }
-            assert ((index, frame) in asked) == wanted, (track.id, frame)
-    assert scene.forecasts == len(asked)
+            assert ((index, frame) in requested) == wanted, (track.id, frame)
+    assert scene.forecasts == len(requested)
 
 
-def test_without_consistency_pairs_alone_are_asked() -> None:
+def test_without_consistency_only_pairs_are_requested() -> None:
     assert sum(scene.forecasts for scene in planned(consistency=False)) == PAIRS
 
 

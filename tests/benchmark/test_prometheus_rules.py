@@ -20,7 +20,7 @@ def read(results: BenchmarkResults) -> list[dict[str, Any]]:
     return found
 
 
-def test_two_rules_a_model_that_was_asked() -> None:
+def test_two_rules_for_each_served_model() -> None:
     found = read(
         made_results(made_model("cab"), made_model("kalman", metrics=made_metrics(1.5)), made_oracle())
     )

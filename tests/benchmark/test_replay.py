@@ -1,4 +1,4 @@
-"""Calls are made once each, so many at a time, and what goes wrong is said."""
+"""Replay: every call once, with bounded concurrency; errors are reported."""
 
 import asyncio
 from pathlib import Path
@@ -33,7 +33,7 @@ CALLS = sum(len(scene.calls) for scene in planned())
 
 
 class Endpoint:
-    """What the replay calls; counts."""
+    """Endpoint that records its requests."""
 
     def __init__(self, fails: dict[int, ForecastError] | None = None) -> None:
         self.requests: list[PredictRequest] = []
@@ -53,7 +53,7 @@ class Endpoint:
 
 
 def run(folder: Path, endpoint: Endpoint, concurrency: int = 3) -> tuple[Replayed, list[int]]:
-    """Replays both scenes; how it went, and what was ticked."""
+    """Outcome of a replay of both scenes, and its ticks."""
     ticks: list[int] = []
     replay = Replay(planned(), MODELS, Protocol.CAUSAL, concurrency)
     assert replay.forecasts() == 2 * FORECASTS
@@ -61,17 +61,17 @@ def run(folder: Path, endpoint: Endpoint, concurrency: int = 3) -> tuple[Replaye
         return asyncio.run(replay.run(cast(AsyncClient, endpoint), archive, ticks.append)), ticks
 
 
-def test_every_model_is_asked_every_call_once(tmp_path: Path) -> None:
+def test_every_call_is_made_once_for_every_model(tmp_path: Path) -> None:
     endpoint = Endpoint()
     replayed, ticks = run(tmp_path, endpoint)
-    asked = [(request.model, request.time, request.agents[0].states[-1].x) for request in endpoint.requests]
-    assert len(asked) == len(set(asked)) == 2 * CALLS
+    called = [(request.model, request.time, request.agents[0].states[-1].x) for request in endpoint.requests]
+    assert len(called) == len(set(called)) == 2 * CALLS
     assert endpoint.most == 3
     assert replayed.requested == sum(ticks) == 2 * FORECASTS
     assert not replayed.refused
 
 
-def test_what_has_its_answer_is_not_asked_again(tmp_path: Path) -> None:
+def test_saved_answers_are_not_requested_again(tmp_path: Path) -> None:
     lost = Unavailable("gone")
     with pytest.raises(BenchmarkError, match="does not answer: gone; answers so far are kept"):
         run(tmp_path, Endpoint({20: lost}), concurrency=1)
@@ -105,7 +105,7 @@ def test_a_refused_call_is_forgotten_once_it_has_an_answer(tmp_path: Path) -> No
         assert not archive.refusals()
 
 
-def test_a_late_answer_is_asked_for_again(tmp_path: Path) -> None:
+def test_a_missed_deadline_is_retried(tmp_path: Path) -> None:
     endpoint = Endpoint({2: DeadlineExceeded("late"), 3: DeadlineExceeded("late")})
     replayed, _ = run(tmp_path, endpoint, concurrency=1)
     assert not replayed.refused

@@ -26,7 +26,7 @@ VOID = {"meta", "img", "link", "br"}
 
 
 class Page(HTMLParser):
-    """What there is in a page; complains of tags that do not match."""
+    """Contents of a page; its tags must match."""
 
     def __init__(self, text: str) -> None:
         super().__init__(convert_charrefs=True)
@@ -61,7 +61,7 @@ class Page(HTMLParser):
 
 
 def heights(line: Line2D) -> list[float]:
-    """What a line shows."""
+    """Heights of a line's points."""
     return [float(value) for value in np.asarray(line.get_ydata())]
 
 
@@ -137,7 +137,7 @@ def test_a_case_tells_its_errors_the_best_first(whole: str) -> None:
     assert f"FDE at 6 s: Kalman filter 38.2 m; {expected}." in captions
 
 
-def test_the_header_says_what_was_asked_of_whom(whole: str) -> None:
+def test_the_header_states_the_settings(whole: str) -> None:
     page = Page(whole)
     facts = dict(zip(page.texts["dt"], page.texts["dd"], strict=True))
     assert facts["Endpoint"] == "127.0.0.1:50051"

@@ -43,7 +43,7 @@ def test_the_server_reads_the_states_that_training_sees(protocol: Protocol) -> N
         np.testing.assert_allclose(getattr(states, field), getattr(scene.states, field), atol=1e-9)
 
 
-def test_all_agents_go_along_and_the_asked_ones_are_marked() -> None:
+def test_all_agents_are_sent_and_the_requested_ones_marked() -> None:
     sent, call = request(Protocol.CAUSAL)
     record = planned()[0].record
     there = [track.id for track in record.tracks if FRAME in track.frames]
@@ -67,7 +67,7 @@ def test_derivatives_go_along_by_the_paper_protocol_alone(protocol: Protocol) ->
 
 
 def test_causal_requests_do_not_know_the_future() -> None:
-    """What comes after the frame may be anything."""
+    """Positions after the frame change nothing."""
     scene = planned()[0]
     changed = [
         replace(one, position=np.where((one.frames > FRAME)[:, None], 0.0, one.position))
@@ -80,7 +80,7 @@ def test_causal_requests_do_not_know_the_future() -> None:
 
 
 def patches(raster: Raster, protocol: Protocol = Protocol.CAUSAL) -> Floats:
-    """What a network sees of a map, of the agents asked for."""
+    """Map patches of the requested agents, as a network gets them."""
     scene, tracks = SceneFrames(planned()[0].record, protocol, 5).at(FRAME)
     _, call = request(protocol)
     seen = Scene(scene.types, scene.states, raster)

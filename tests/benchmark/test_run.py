@@ -55,7 +55,7 @@ def made(folder: Path, protocol: Protocol = Protocol.CAUSAL, limit: int | None =
 
 
 def ask(whole: Benchmark, address: str, *names: str) -> dict[str, Model]:
-    """Models that were asked for all forecasts without a saved answer."""
+    """Models whose forecasts without a saved answer were requested."""
 
     async def go() -> dict[str, Model]:
         async with AsyncClient(address, timeout=30, retries=1000) as client:
@@ -74,7 +74,7 @@ def evaluated(
 
 
 def same(one: BenchmarkResults, other: BenchmarkResults) -> None:
-    """Everything is equal but what the clock told."""
+    """Compare everything but durations."""
     for left, right in zip(one.models, other.models, strict=True):
         assert left.key == right.key
         np.testing.assert_equal(dict(left.metrics), dict(right.metrics))
@@ -185,7 +185,7 @@ def test_a_server_that_restarts_midway_loses_nothing(tmp_path: Path, models: Pat
     assert all(sum(model.statuses.values()) == PAIRS for model in results.models if model.version)
 
 
-def test_answers_to_something_else_are_not_judged(tmp_path: Path, server: Server) -> None:
+def test_answers_of_another_run_are_refused(tmp_path: Path, server: Server) -> None:
     ask(made(tmp_path, limit=5), f"grpc://{server.grpc_address}", "kalman")
     with pytest.raises(BenchmarkError, match="holds answers of another run: limit was 5, is none"):
         made(tmp_path).saved_models()

@@ -23,7 +23,7 @@ from tests.model.metrics.builders import random_mixture
 
 
 def planned(token: bool = True) -> PlannedScene:
-    """A scene whose calls nobody looks at."""
+    """A scene without calls."""
     made = record(token=token)
     return PlannedScene(made, made.pairs, 0, ())
 
@@ -47,14 +47,14 @@ def wandering(modes: int, seed: int = 0) -> TrajectoryMixture:
 
 
 def weighted(mixture: TrajectoryMixture, weights: Floats) -> TrajectoryMixture:
-    """The same with the weights [K] in all rows."""
+    """Mixture with the weights [K] in all rows."""
     with np.errstate(divide="ignore"):
         logs = torch.from_numpy(np.log(weights)).expand(len(mixture), -1)
     return replace(mixture, log_weights=logs)
 
 
 def figures(entries: list[Entry]) -> dict[str, Floats]:
-    """What a reader of entries finds, one after the other."""
+    """Figures of the entries, one after the other, as a reader computes them."""
     found: dict[str, list[float]] = {}
     for entry, truth in zip(entries, SCENE.truth()[:, None], strict=True):
         modes = np.array(entry["prediction"])[None]
@@ -89,7 +89,7 @@ def test_what_was_answered_comes_back_out_of_the_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("modes", [1, 3, MAX_MODES, MAX_MODES + 1, 3 * MAX_MODES])
-def test_the_likeliest_modes_are_kept(modes: int) -> None:
+def test_the_most_likely_modes_are_kept(modes: int) -> None:
     mixture = wandering(modes, seed=modes)
     entries = submission_entries(SCENE, answered(mixture))
     kept = min(modes, MAX_MODES)

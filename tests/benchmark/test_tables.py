@@ -162,7 +162,7 @@ def test_all_pairs_alone_are_no_hard_cases() -> None:
     assert not [table for table in tables(made_results(model)) if table.title.startswith("3")]
 
 
-def test_asked_for_but_never_complete() -> None:
+def test_requested_but_never_complete() -> None:
     unknown = dict.fromkeys((name for name in made_metrics() if "dispersion" in name), math.nan)
     model = replace(made_model(metrics=without("dispersion", "convergence") | unknown), instants=0)
     assert [reason for reason in left_out(made_results(model)) if "every age" in reason]

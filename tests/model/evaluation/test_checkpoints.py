@@ -41,7 +41,7 @@ def models(tmp_path: Path) -> tuple[Learned, ...]:
 
 def test_figures_are_those_of_forecasts_from_the_scene(tmp_path: Path, models: tuple[Learned, ...]) -> None:
     """A cache's features and patches are those that a server makes of the scene."""
-    judged = evaluate(tmp_path, models, Sampling(8, 9))
+    means = evaluate(tmp_path, models, Sampling(8, 9))
     for model in models:
         fde: list[float] = []
         off_road: list[float] = []
@@ -55,7 +55,7 @@ def test_figures_are_those_of_forecasts_from_the_scene(tmp_path: Path, models: t
                 metrics = instance_metrics(forecast, truth, [one.raster], seeds, samples=8, draws=0)
                 fde += metrics["fde_f_6s_m"].tolist()
                 off_road += metrics["off_road_ml"].tolist()
-        found = judged[f"{model.info.name}@1.0.0"].metrics
+        found = means[f"{model.info.name}@1.0.0"].metrics
         assert found.mean("fde_f_6s_m") == pytest.approx(np.mean(fde), rel=1e-3)
         assert found.mean("off_road_ml") == pytest.approx(np.mean(off_road), abs=0.02)
         assert found.count("inside_90") == len(fde)
@@ -89,9 +89,9 @@ def test_a_cache_tells_who_stood_as_the_scene_does(tmp_path: Path, models: tuple
     assert means.figures()["merged_modes_90_median"] in (1, 1.5, 2, 2.5, 3)
 
 
-def test_ablation_judges_what_a_model_looks_at(tmp_path: Path, models: tuple[Learned, ...]) -> None:
-    judged = evaluate(tmp_path, models, ablate=True, limit=20)
-    cab, alone = judged["cab@1.0.0"], judged["trajectron-no-context@1.0.0"]
+def test_ablation_removes_only_what_a_model_uses(tmp_path: Path, models: tuple[Learned, ...]) -> None:
+    means = evaluate(tmp_path, models, ablate=True, limit=20)
+    cab, alone = means["cab@1.0.0"], means["trajectron-no-context@1.0.0"]
     assert set(cab.ablated) == set(Without)
     assert not alone.ablated
     errors = {one.mean("ade_ml_6s_m") for one in (cab.metrics, *cab.ablated.values())}
@@ -109,9 +109,9 @@ def test_covernet_has_a_cache_of_its_own(tmp_path: Path) -> None:
         ["covernet"],
     ]
     (found, group) = opened[1]
-    judged = evaluate_checkpoints(found, group, True, NO_DRAWS)["covernet@1.0.0"]
-    assert set(judged.ablated) == set(Without)
-    nll = {one.mean("nll") for one in (judged.metrics, *judged.ablated.values())}
+    means = evaluate_checkpoints(found, group, True, NO_DRAWS)["covernet@1.0.0"]
+    assert set(means.ablated) == set(Without)
+    nll = {one.mean("nll") for one in (means.metrics, *means.ablated.values())}
     assert len(nll) == 4  # the boxes, too, are taken away
 
 
