@@ -340,7 +340,7 @@ async def test_a_million_agents_are_refused_in_no_time(body: bytes, content_type
 
 _TOO_LARGE = {
     "application/x-protobuf": "more than 512 agents",
-    "application/json": "more objects than 512 agents and 262144 states have",
+    "application/json": "more objects and lists than 512 agents and 262144 states can have",
 }
 
 
