@@ -1,5 +1,6 @@
 """Loaded models by name, with the default and the fallback."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol as Interface
 
@@ -48,6 +49,8 @@ class Catalog:
     models: Models
     default: Forecaster
     fallback: Forecaster
+    by_name: Mapping[str, Forecaster]
+    """All models by "name" and by "name@version"."""
 
     def get(self, name: str) -> Forecaster:
         """Return a model by "name" or "name@version"; the default for the empty name.
@@ -59,8 +62,10 @@ class Catalog:
             return self.default
         if len(name) > _MAX_NAME:
             raise UnknownModel(f"no model has a name of {len(name)} characters")
+        if (forecaster := self.by_name.get(name)) is not None:
+            return forecaster
         try:
-            return self.models.get(name)
+            return self.models.get(name)  # a version may be spelt in other ways
         except UnknownModelError as error:
             raise UnknownModel(str(error)) from error
 
@@ -110,7 +115,8 @@ def build_catalog(models: Models, default: str | None) -> Catalog:
     else:
         name, why = _ELSE, f"{_PREFERRED} is not loaded"
     try:
-        catalog = Catalog(models, models.get(name), models.get(FALLBACK_MODEL))
+        by_name = {name: models.get(name) for info in models.infos() for name in (info.name, info.full_name)}
+        catalog = Catalog(models, models.get(name), models.get(FALLBACK_MODEL), by_name)
     except UnknownModelError as error:
         raise SettingsError(f"default_model: {error}") from error
     for info in models.infos():
