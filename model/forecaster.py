@@ -103,6 +103,16 @@ class Forecaster(ABC):
             steps: T, at most ``info.steps``; None: ``info.steps``.
         """
 
+    def compile(self, threads: int | None = None) -> bool:
+        """Run forwards as native calls from now on, and return whether they are.
+
+        Answers stay the same within 1e-3 m. A forecaster without a native forward changes nothing.
+
+        Args:
+            threads: the threads of a forward; None: all cores.
+        """
+        return False
+
     def requires_heading(self, agent_type: AgentType) -> bool:
         """Return whether a forecast of an agent of that type needs its heading now."""
         return False

@@ -13,7 +13,7 @@ from model.registry import DuplicateModelError, Registry
 from service.errors import Unavailable
 from service.predict.catalog import Models
 from service.predict.dataplane import DataPlane
-from service.settings import Settings, SettingsError, bundled_models
+from service.settings import Engine, Settings, SettingsError, bundled_models
 from service.telemetry.metrics import Metrics
 from service.transports.grpc.server import GrpcServer
 from service.transports.rest.server import HttpServer, build_app
@@ -186,6 +186,9 @@ def _load_models(settings: Settings) -> Registry:
     if settings.models is not None and not settings.models.is_dir():
         raise SettingsError(f"models: no such folder: {settings.models}")
     registry = Registry.load(folder, allow_paper=settings.allow_paper_protocol)
+    if settings.engine is Engine.ONNXRUNTIME:
+        for info in registry.infos():
+            registry.get(info.full_name).compile(settings.threads)
     _log.info(
         "models loaded", folder=str(folder) if folder else None, models=[i.name for i in registry.infos()]
     )

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -24,6 +25,13 @@ FALLBACK_MODEL = "constant-velocity-yaw"
 
 class SettingsError(Exception):
     """Error of invalid settings; the text names the setting and says why."""
+
+
+class Engine(StrEnum):
+    """Engines of the forward."""
+
+    ONNXRUNTIME = "onnxruntime"
+    EAGER = "eager"
 
 
 class Settings(BaseSettings):
@@ -83,6 +91,9 @@ class Settings(BaseSettings):
     """Seconds that accepted calls get to finish when the server stops."""
     threads: int | None = Field(default=None, ge=1)
     """Number of threads of the forward; None: the physical cores."""
+    engine: Engine = Engine.ONNXRUNTIME
+    """Engine of the forward: ``onnxruntime`` runs networks of the agent's frame as one native call and all
+    other models in PyTorch; ``eager`` runs all models in PyTorch."""
 
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     """Least severe level that is logged."""

@@ -17,6 +17,8 @@ from model.mixture import TrajectoryMixture
 from model.networks.agent_frame import AgentFrameNetwork
 from model.networks.config import AnyNetworkConfig, CoverNetConfig, NetworkConfig
 from model.networks.covernet import CoverNet
+from model.networks.dynamics import Positions
+from model.networks.graph import GraphForward
 from model.networks.cvae import AgentNetwork
 from model.scenes.scene import AgentType, Scene
 
@@ -24,6 +26,9 @@ MIN_VARIANCE = 1e-6
 """m²; the variance of a served forecast is at least that in every direction."""
 
 Network = TypeVar("Network", bound=nn.Module)
+
+Forward = Callable[[Features, Context, int], tuple[Tensor, Positions]]
+"""Features, context and steps T → log-weights [N, K] and positions relative to now."""
 
 
 class Networks(nn.ModuleDict, Generic[Network]):
@@ -73,6 +78,18 @@ class NetworkForecaster(Forecaster, Generic[SomeNetworks]):
         _check(dict(self.networks.state_dict()), tensors)
         self.networks.load_state_dict(dict(tensors), assign=True)
         self.networks.eval().requires_grad_(False)
+        self._graphs: dict[tuple[AgentType, Context], GraphForward] = {}
+
+    def compile(self, threads: int | None = None) -> bool:
+        contexts = (Context.FULL, Context.BLIND) if self.info.supports_blind else (Context.FULL,)
+        for agent_type in self.info.agent_types:
+            for context in contexts:
+                try:
+                    graph = GraphForward(self.networks.of(agent_type), self.config, context, threads)
+                except LookupError:
+                    return False
+                self._graphs[agent_type, context] = graph
+        return True
 
     def requires_heading(self, agent_type: AgentType) -> bool:
         """Return True for vehicles: a pedestrian's state has no heading, and it sees no map."""
@@ -106,17 +123,17 @@ class NetworkForecaster(Forecaster, Generic[SomeNetworks]):
         context: Context = Context.FULL,
         steps: int | None = None,
     ) -> TrajectoryMixture:
-        network = self.networks.of(agent_type)
+        network = self._graphs.get((agent_type, context)) or self.networks.of(agent_type)
         return network_mixture(network, features, context, steps or self.info.steps, MIN_VARIANCE)
 
 
 def network_mixture(
-    network: nn.Module, features: Features, context: Context, steps: int, min_variance: float | None = None
+    network: Forward, features: Features, context: Context, steps: int, min_variance: float | None = None
 ) -> TrajectoryMixture:
     """Return the forecast of a network as a mixture.
 
     Args:
-        network: one of ``Networks``.
+        network: one of ``Networks``, or its graph.
         features: the features of N agents.
         context: full or blind.
         steps: T.

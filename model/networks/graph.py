@@ -88,6 +88,7 @@ class GraphForward:
         file = GRAPHS / graph_name(config, context)
         if not file.is_file():
             raise LookupError(f"there is no graph {graph_name(config, context)}")
+        self._context = context
         self._inputs = tuple(graph_inputs(config, context))
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads or 0
@@ -105,13 +106,19 @@ class GraphForward:
             file.read_bytes(), options, providers=["CPUExecutionProvider"]
         )
 
-    def __call__(self, features: Features, steps: int) -> tuple[torch.Tensor, Positions]:
+    def __call__(self, features: Features, context: Context, steps: int) -> tuple[torch.Tensor, Positions]:
         """Return log-weights [N, K] and positions relative to now, as the network does.
 
         Args:
-            features: N agents' features.
+            features: the features of N agents.
+            context: the graph's.
             steps: T, at most 12.
+
+        Raises:
+            ValueError: the graph is of another context, or has fewer steps.
         """
+        if context is not self._context or steps > STEPS:
+            raise ValueError(f"this graph forecasts {STEPS} steps with {self._context.value} context")
         given = {name: features[name].contiguous().numpy() for name in self._inputs}
         log_weights, means, covariances = map(torch.from_numpy, self._session.run(OUTPUTS, given))
         if steps != STEPS:
