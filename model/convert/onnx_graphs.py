@@ -3,8 +3,8 @@
 A graph holds operations only: every parameter is an external initializer, which a checkpoint fills
 (``model.networks.graph``). So there is one graph for each architecture, and it ships with the package.
 
-Run ``python -m model.convert.onnx_graphs`` after a change of ``model.networks.agent_frame``. The tests compare
-each graph with the network itself.
+Run ``python -m model.convert.onnx_graphs`` after a change of ``model.networks.agent_frame``. The tests
+compare each graph with the network itself.
 """
 
 from collections.abc import Iterator, Mapping
@@ -70,7 +70,12 @@ def export_graph(config: NetworkConfig, context: Context) -> tuple[onnx.ModelPro
     table[torch.ops.aten.hypot.default] = lambda x, y: (x * x + y * y).sqrt()
     exported = exported.run_decompositions(table)
     program = torch.onnx.export(
-        exported, dynamo=True, optimize=False, input_names=list(names), output_names=list(OUTPUTS), verbose=False
+        exported,
+        dynamo=True,
+        optimize=False,
+        input_names=list(names),
+        output_names=list(OUTPUTS),
+        verbose=False,
     )
     assert program is not None  # noqa: S101 (for the type checker: it is None only when written to a file)
     model: onnx.ModelProto = program.model_proto

@@ -17,9 +17,9 @@ from model.mixture import TrajectoryMixture
 from model.networks.agent_frame import AgentFrameNetwork
 from model.networks.config import AnyNetworkConfig, CoverNetConfig, NetworkConfig
 from model.networks.covernet import CoverNet
+from model.networks.cvae import AgentNetwork
 from model.networks.dynamics import Positions
 from model.networks.graph import GraphForward
-from model.networks.cvae import AgentNetwork
 from model.scenes.scene import AgentType, Scene
 
 MIN_VARIANCE = 1e-6

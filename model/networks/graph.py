@@ -1,8 +1,9 @@
 """The forward of a network of the agent's frame as one native call (ONNX Runtime).
 
-It holds no lock of the interpreter while it runs, and its threads wait passively, so it keeps its speed beside
-busy neighbours. The graphs ship with the package and hold operations only (``model.convert.onnx_graphs`` makes
-them); parameters come from the checkpoint. Nothing is executed that a checkpoint brings.
+It holds no lock of the interpreter while it runs, and its threads wait passively, so it keeps its speed
+beside busy neighbours. The graphs ship with the package and hold operations only
+(``model.convert.onnx_graphs`` makes them); parameters come from the checkpoint. Nothing is executed that a
+checkpoint brings.
 """
 
 from pathlib import Path

@@ -1,13 +1,14 @@
 """Dynamic batching: calls that wait for the model at the same time share a forward.
 
 A batch starts as soon as the model is free and never waits for more calls: under light load a call runs
-alone, under heavy load batches grow by themselves. Everything except the forward runs on the event loop, so
-there are no locks.
+alone, under heavy load batches grow by themselves. The most urgent work goes first, and a call that would be
+late is refused when it arrives (``service.predict.scheduler``). Everything except the forward runs on the
+event loop, so there are no locks.
 """
 
 import asyncio
+import math
 import time
-from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, contextmanager
@@ -21,6 +22,7 @@ from model.forecaster import Context, Features, Forecaster, agent_count, join
 from model.mixture import TrajectoryMixture
 from model.scenes.scene import AgentType
 from service.errors import DeadlineExceeded, Internal, Overloaded, Unavailable
+from service.predict.scheduler import MAX_BATCH_SECONDS, MIN_BATCH_AGENTS, CostModel, DeadlineQueue
 from service.predict.torch_threads import set_forward_threads
 from service.telemetry.metrics import Metrics
 
@@ -30,9 +32,6 @@ _T = TypeVar("_T")
 
 _MIN_RETRY = 0.05
 _MAX_RETRY = 10.0
-_FIRST_RATE = 500.0
-"""agents/s; a guess until the first batch has been measured."""
-_SMOOTHING = 0.2
 
 
 class Call:
@@ -49,6 +48,8 @@ class Call:
         """Start of the work for the call, by ``time.perf_counter``."""
         self.places = 0
         """Number of queue places held."""
+        self.undecoded = 0
+        """Number of agents that have a place and are not in the queue yet."""
 
     def remaining(self) -> float:
         """Return the seconds until the deadline; negative after it."""
@@ -86,6 +87,11 @@ class Job:
         """Number of agents."""
         return agent_count(self.features)
 
+    @property
+    def key(self) -> tuple[int, AgentType, Context]:
+        """Key of the jobs that can share a forward."""
+        return id(self.forecaster), self.agent_type, self.context
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -118,7 +124,17 @@ class _Entry:
     @property
     def key(self) -> tuple[int, AgentType, Context]:
         """Key of the entries that can share a forward."""
-        return id(self.job.forecaster), self.job.agent_type, self.job.context
+        return self.job.key
+
+    @property
+    def deadline(self) -> float:
+        """Deadline of the call, on the event loop's clock, s."""
+        return self.call.deadline
+
+    @property
+    def finished(self) -> bool:
+        """Whether the entry has been cancelled or has failed meanwhile."""
+        return self.done.done()
 
 
 class Batcher:
@@ -137,11 +153,12 @@ class Batcher:
         self._max_batch = max_batch_agents
         self._max_queue = max_queue_agents
         self._metrics = metrics
-        self._queue: deque[_Entry] = deque()
+        self._costs = CostModel()
+        self._queue: DeadlineQueue[_Entry] = DeadlineQueue(self._costs)
         self._running: list[_Entry] = []
         self._running_since = 0.0
         self._waiting = 0
-        self._rate = _FIRST_RATE
+        self._undecoded = 0
         self._wake = asyncio.Event()
         self._thread = ThreadPoolExecutor(
             1, thread_name_prefix="forward", initializer=set_forward_threads, initargs=(threads,)
@@ -186,9 +203,10 @@ class Batcher:
             deadline: the time on the event loop's clock; work that has not started by then never does.
 
         Raises:
-            Overloaded: the queue has no room for even the smallest call.
+            Overloaded: the queue has no room for even the smallest call, or the call would be late.
         """
         self._require_room(1)
+        self._require_time(deadline, 0)
         return Call(deadline)
 
     @contextmanager
@@ -200,15 +218,20 @@ class Batcher:
             agents: number of agents to forecast; a call without any takes one place.
 
         Raises:
-            Overloaded: the queue has no room for so many.
+            Overloaded: the queue has no room for so many, or they would be late.
         """
         agents = max(agents, 1)
         self._require_room(agents)
+        self._require_time(call.deadline, agents)
         call.places += agents
+        call.undecoded = agents
+        self._undecoded += agents
         self._count(agents)
         try:
             yield
         finally:
+            self._undecoded -= call.undecoded
+            call.undecoded = 0
             self._release(call, call.places)
 
     async def run(self, jobs: Sequence[Job], call: Call) -> list[Outcome]:
@@ -233,7 +256,13 @@ class Batcher:
         surplus = call.places - sum(entry.agents for entry in entries)
         if surplus > 0:  # agents that need no forward give their places back at once
             self._release(call, surplus)
-        self._queue.extend(entries)
+        self._undecoded -= call.undecoded
+        call.undecoded = 0
+        for part in parts:
+            lag = 0.0
+            for entry in part:
+                self._queue.put(entry, lag)
+                lag += self._costs.seconds(entry.key, entry.agents)
         self._wake.set()
         try:
             for entry in entries:
@@ -244,8 +273,9 @@ class Batcher:
         return [_combine([entry.done.result() for entry in part]) for part in parts]
 
     async def run_in_model_thread(self, job: Job) -> None:
-        """Run a job past the queue, for warm-up."""
-        await self.call_in_model_thread(_forward, job, [job.features], job.steps)
+        """Run a job past the queue, for warm-up, and learn how long it takes."""
+        _, seconds = await self.call_in_model_thread(_forward, job, [job.features], job.steps)
+        self._costs.measure(job.key, job.agents, seconds)
 
     async def call_in_model_thread(self, function: Callable[..., _T], *arguments: object) -> _T:
         """Call a function in the thread of the forward, past the queue."""
@@ -255,8 +285,10 @@ class Batcher:
         """Return the job in parts that fit a batch."""
         queued = time.perf_counter()
         entries = []
-        for start in range(0, job.agents, self._max_batch):
-            stop = min(start + self._max_batch, job.agents)
+        within = self._costs.agents_within(job.key, MAX_BATCH_SECONDS)
+        size = min(self._max_batch, max(within, MIN_BATCH_AGENTS))
+        for start in range(0, job.agents, size):
+            stop = min(start + size, job.agents)
             whole = stop - start == job.agents
             features = job.features if whole else {name: t[start:stop] for name, t in job.features.items()}
             entries.append(_Entry(job, features, stop - start, call, queued))
@@ -265,8 +297,7 @@ class Batcher:
     def _withdraw(self, entries: Sequence[_Entry]) -> None:
         """Remove a call's entries from the queue, in whatever state they are."""
         for entry in entries:
-            if entry in self._queue:
-                self._queue.remove(entry)
+            self._queue.remove(entry)
             if not entry.done.cancel() and not entry.done.cancelled():
                 entry.done.exception()  # retrieved, or asyncio would log that it never was
 
@@ -314,25 +345,12 @@ class Batcher:
             self._on_crash()
 
     def _take_batch(self) -> list[_Entry]:
-        """Take the oldest entry and all that can share its batch, in order; drop expired entries."""
+        """Take the most urgent batch, and fail the entries that would be late."""
         now = asyncio.get_running_loop().time()
-        batch: list[_Entry] = []
-        rest: deque[_Entry] = deque()
-        agents, full = 0, False
-        for entry in self._queue:
-            if entry.done.done():
-                continue
-            if entry.call.deadline <= now:
-                entry.done.set_exception(DeadlineExceeded("the deadline passed while the call was queued"))
-            elif (batch and entry.key != batch[0].key) or full:
-                rest.append(entry)
-            elif agents + entry.agents > self._max_batch:
-                full = True  # younger entries must not overtake this one
-                rest.append(entry)
-            else:
-                batch.append(entry)
-                agents += entry.agents
-        self._queue = rest
+        batch, late = self._queue.take_batch(now, self._max_batch)
+        for entry in late:
+            self._metrics.refused.labels("dropped").inc()
+            entry.done.set_exception(DeadlineExceeded("the deadline passed while the call was queued"))
         for entry in batch:
             self._release(entry.call, entry.agents)
         return batch
@@ -357,8 +375,7 @@ class Batcher:
 
     def _measure(self, batch: Sequence[_Entry], started: float, seconds: float) -> None:
         agents = sum(entry.agents for entry in batch)
-        rate = agents / max(seconds, 1e-6)
-        self._rate += _SMOOTHING * (rate - self._rate)
+        self._costs.measure(batch[0].key, agents, seconds)
         self._metrics.batch_agents.observe(agents)
         self._metrics.inference.labels(batch[0].job.forecaster.info.name).observe(seconds)
         for entry in batch:
@@ -366,14 +383,56 @@ class Batcher:
 
     def _require_room(self, agents: int) -> None:
         if self._waiting + agents > self._max_queue:
+            self._metrics.refused.labels("queue_full").inc()
             raise Overloaded(
                 f"{self._waiting} agents are queued, and at most {self._max_queue} may be",
                 self._retry_after(),
             )
 
+    def _require_time(self, deadline: float, agents: int) -> None:
+        """Refuse a call that would be late.
+
+        A call is never refused while the model is free and nothing waits: estimates may be wrong.
+
+        Args:
+            deadline: the time on the event loop's clock, s.
+            agents: number of agents to forecast; 0: not known yet.
+
+        Raises:
+            Overloaded: work that goes first leaves too little time.
+        """
+        wait = self._expected_wait(deadline)
+        if wait == 0.0:
+            return
+        needed = wait + self._costs.seconds_of_unknown(agents) + self._costs.around
+        remaining = deadline - asyncio.get_running_loop().time()
+        if needed > remaining:
+            self._metrics.refused.labels("late").inc()
+            raise Overloaded(
+                f"the forecast would take {needed:.2f} s, and the deadline is in {max(remaining, 0):.2f} s",
+                self._retry_after(),
+            )
+
+    def _expected_wait(self, deadline: float) -> float:
+        """Return the expected seconds until the model is free for a new call of that deadline; 0 if it is."""
+        wait = self._queue.seconds_before(deadline) + self._costs.seconds_of_unknown(self._undecoded)
+        if self._running:
+            running = sum(self._costs.seconds(entry.key, entry.agents) for entry in self._running)
+            wait += max(running - self.forward_seconds, 1e-3)
+        return wait
+
+    def measure_call(self, call: Call, in_batcher: float) -> None:
+        """Learn from a call that was answered how long it takes outside the batcher.
+
+        Args:
+            call: the call.
+            in_batcher: seconds that it spent in ``run``.
+        """
+        self._costs.measure_around(time.perf_counter() - call.started - in_batcher)
+
     def _retry_after(self) -> float:
-        """Return the seconds until the agents that are queued now should have been forecast."""
-        return min(max(self._waiting / self._rate, _MIN_RETRY), _MAX_RETRY)
+        """Return the seconds until the work that is queued now should be done."""
+        return min(max(self._expected_wait(math.inf), _MIN_RETRY), _MAX_RETRY)
 
     def _count(self, agents: int) -> None:
         self._waiting += agents

@@ -107,7 +107,9 @@ class Pipeline:
                     make_plan, message, options, forecaster, self.catalog, self._settings, agents
                 )
                 # Batch
+                queued = time.perf_counter()
                 await self._forecast(plan, call)
+                in_batcher = time.perf_counter() - queued
             # Encode and remember; the track memory usually responds while the response is being encoded
             encoding = self._in_thread(self._encode, plan, _seed(options))
             if not options.scene_id:
@@ -115,6 +117,7 @@ class Pipeline:
             else:
                 response, stored = await asyncio.gather(encoding, self._remember(plan, recalled, call))
                 report(response, recalled, stored)
+        self._batcher.measure_call(call, in_batcher)
         self._count_agents(plan)
         return response
 

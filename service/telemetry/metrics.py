@@ -84,6 +84,15 @@ class Metrics:
             "Accepted agents that wait in the queue.",
             registry=self.registry,
         )
+        self.refused = Counter(
+            "forecast_refused_total",
+            "Calls refused as overload: the queue was full, or the forecast would have been late; and calls "
+            "dropped from the queue because they had become late.",
+            ["reason"],
+            registry=self.registry,
+        )
+        for reason in ("queue_full", "late", "dropped"):
+            self.refused.labels(reason)
         self.model_info = Gauge(
             "forecast_model_info",
             "1 for each loaded model.",

@@ -1,0 +1,131 @@
+"""Earliest deadline first, and expected waits."""
+
+from dataclasses import dataclass
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.predict.scheduler import MAX_BATCH_SECONDS, MIN_BATCH_AGENTS, CostModel, DeadlineQueue
+
+
+@dataclass(eq=False)
+class Entry:
+    deadline: float
+    agents: int = 1
+    key: str = "model"
+    finished: bool = False
+
+
+def costs(rate: float = 1000.0, key: str = "model") -> CostModel:
+    model = CostModel()
+    model.measure(key, int(rate), 1.0)
+    return model
+
+
+def queue(*entries: Entry, rate: float = 1000.0) -> DeadlineQueue[Entry]:
+    made: DeadlineQueue[Entry] = DeadlineQueue(costs(rate))
+    for entry in entries:
+        made.put(entry)
+    return made
+
+
+def test_the_earliest_deadline_goes_first_and_equal_ones_in_order_of_arrival() -> None:
+    late, first, second = Entry(9.0), Entry(5.0), Entry(5.0)
+    batch, dropped = queue(late, first, second).take_batch(0.0, 2)
+    assert batch == [first, second]
+    assert not dropped
+
+
+def test_a_batch_holds_one_key_and_the_rest_waits() -> None:
+    one, other, third = Entry(1.0), Entry(2.0, key="other"), Entry(3.0)
+    waiting = queue(one, other, third)
+    assert waiting.take_batch(0.0, 8)[0] == [one, third]
+    assert waiting.take_batch(0.0, 8)[0] == [other]
+    assert len(waiting) == 0
+
+
+def test_nothing_overtakes_an_entry_of_its_key_that_does_not_fit() -> None:
+    one, large, small = Entry(1.0, 5), Entry(2.0, 5), Entry(3.0, 1)
+    waiting = queue(one, large, small)
+    assert waiting.take_batch(0.0, 8)[0] == [one]
+    assert waiting.take_batch(0.0, 8)[0] == [large, small]
+
+
+def test_entries_that_would_be_late_are_dropped_before_they_take_the_models_time() -> None:
+    hopeless, possible, cancelled = Entry(10.05, 100), Entry(10.2, 100), Entry(10.01, finished=True)
+    batch, dropped = queue(hopeless, possible, cancelled).take_batch(10.0, 256)
+    assert batch == [possible]
+    assert dropped == [hopeless]
+
+
+def test_a_batch_ends_where_it_would_take_too_long() -> None:
+    rate = 2 * MIN_BATCH_AGENTS / MAX_BATCH_SECONDS
+    entries = [Entry(100.0, MIN_BATCH_AGENTS) for _ in range(4)]
+    assert len(queue(*entries, rate=rate).take_batch(0.0, 1000)[0]) == 2
+    slow = [Entry(1e9, MIN_BATCH_AGENTS // 2) for _ in range(4)]
+    assert len(queue(*slow, rate=1.0).take_batch(0.0, 1000)[0]) == 2  # never less than MIN_BATCH_AGENTS
+
+
+def test_parts_of_a_large_call_lag_so_that_small_calls_get_between() -> None:
+    waiting = queue()
+    parts = [Entry(10.0, 50) for _ in range(3)]
+    for number, part in enumerate(parts):
+        waiting.put(part, lag=0.05 * number)
+    small = Entry(10.02)
+    waiting.put(small)
+    assert list(waiting) == [parts[0], small, parts[1], parts[2]]
+
+
+def test_the_expected_wait_counts_what_goes_first() -> None:
+    waiting = queue(Entry(1.0, 100), Entry(2.0, 100), Entry(3.0, 100), Entry(4.0, 100))
+    assert waiting.seconds_before(0.5) == 0
+    assert waiting.seconds_before(2.5) == pytest.approx(0.2)
+    assert waiting.seconds_before(9.0) == pytest.approx(0.4)
+    assert len(waiting.take_batch(0.0, 200)[0]) == 1  # 100 agents take longer than a batch should
+    assert waiting.seconds_before(9.0) == pytest.approx(0.3)
+
+
+def test_removed_entries_are_no_wait() -> None:
+    entry = Entry(1.0, 100)
+    waiting = queue(entry, Entry(2.0, 300))
+    waiting.remove(entry)
+    waiting.remove(entry)
+    assert waiting.seconds_before(9.0) == pytest.approx(0.3)
+    waiting.clear()
+    assert waiting.seconds_before(9.0) == 0
+
+
+def test_costs_are_learned_by_key() -> None:
+    model = costs(1000.0)
+    model.measure("slow", 10, 1.0)
+    assert model.seconds("model", 100) == pytest.approx(0.1)
+    assert model.seconds("slow", 100) == pytest.approx(10.0)
+    assert model.seconds("new", 100) == model.seconds_of_unknown(100) == pytest.approx(10.0)
+    for _ in range(50):
+        model.measure("slow", 1000, 1.0)
+    assert model.seconds("slow", 100) == pytest.approx(0.1, rel=0.01)
+
+
+@given(
+    st.lists(
+        st.tuples(st.floats(0, 100), st.integers(1, 40), st.sampled_from("ab"), st.booleans()), max_size=30
+    ),
+    st.integers(1, 64),
+)
+def test_every_entry_leaves_once_in_a_batch_or_as_late(
+    made: list[tuple[float, int, str, bool]], max_agents: int
+) -> None:
+    entries = [Entry(deadline, agents, key, finished) for deadline, agents, key, finished in made]
+    waiting = queue(*entries, rate=200.0)
+    left: list[Entry] = []
+    for _ in range(len(entries) + 1):
+        batch, late = waiting.take_batch(50.0, max_agents)
+        assert len({entry.key for entry in batch}) <= 1
+        assert sum(entry.agents for entry in batch) <= max_agents or len(batch) == 1
+        assert all(entry.deadline < 50.0 + entry.agents / 200.0 + 1.0 for entry in late)
+        left += [*batch, *late]
+        if not batch:
+            break
+    assert len(waiting) == 0
+    assert sorted(map(id, left)) == sorted(id(entry) for entry in entries if not entry.finished)
