@@ -89,9 +89,12 @@ def _strip(model: onnx.ModelProto) -> None:
     for node in [*model.graph.node, *(n for function in model.functions for n in function.node)]:
         del node.metadata_props[:]
         node.ClearField("doc_string")
-    for value in [*model.graph.value_info, *model.graph.input, *model.graph.output, *model.graph.initializer]:
+    for value in [*model.graph.input, *model.graph.output]:
         del value.metadata_props[:]
         value.ClearField("doc_string")
+    for initializer in model.graph.initializer:
+        del initializer.metadata_props[:]
+        initializer.ClearField("doc_string")
     del model.graph.value_info[:]
     del model.graph.metadata_props[:]
 
