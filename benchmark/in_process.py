@@ -1,7 +1,7 @@
 """Replay of the planned calls by forecasters in this process, without an endpoint.
 
-Forecasters see a scene as in training (``model.data.protocols``). Their answers are saved like those of an
-endpoint, so that evaluation, tables and report are the same.
+Forecasters see the same agents and the same part of the map as in a request to an endpoint. Their answers
+are saved like those of an endpoint, so that evaluation, tables and report are the same.
 """
 
 import time
@@ -13,6 +13,7 @@ import numpy as np
 from benchmark.archive import Answer, Archive
 from benchmark.plan import Call, PlannedScene
 from benchmark.replay import Replayed, keep_most_likely
+from benchmark.requests import crop
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.arrays import Ints
 from model.data.checks import FUTURE_STEPS
@@ -57,13 +58,15 @@ def replay_in_process(
 def _answer(forecaster: Forecaster, frames: SceneFrames, scene: PlannedScene, call: Call) -> Answer:
     started = time.perf_counter()
     observed, present = frames.at(call.frame)
-    observed = replace(observed, states=observed.states.last_frames(forecaster.info.history_frames))
     tracks = present[np.isin(present, call.tracks)]
     rows = np.searchsorted(present, tracks)
     response = pb.PredictResponse(time=call.frame * STEP_SECONDS, steps=FUTURE_STEPS, step=STEP_SECONDS)
     if len(rows):
+        states = observed.states.last_frames(forecaster.info.history_frames)
+        visible = crop(scene.record.raster, states.position[rows, -1])
+        observed = replace(observed, states=states, raster=visible)
         mixture = forecaster(observed, rows, steps=FUTURE_STEPS)
-        history_frames = observed.states.frames - observed.states.first[rows]
+        history_frames = states.frames - states.first[rows]
         ids = [scene.record.tracks[track].id for track in tracks.tolist()]
         response.forecasts.extend(_forecasts(mixture, ids, history_frames, forecaster.info.history_frames))
         keep_most_likely(response, call, scene)

@@ -51,7 +51,7 @@ class SceneRequests:
             time=call.frame * STEP_SECONDS,
             agents=agents,
             merge=False,  # the metrics need the model's own modes, and merge them themselves
-            raster=crop(self._scene.record.raster, around),
+            raster=raster_message(crop(self._scene.record.raster, around)),
         )
 
     def _agent(self, observations: Observations, row: int, track: int, predict: bool) -> Agent:
@@ -70,7 +70,7 @@ class SceneRequests:
         )
 
 
-def crop(raster: Raster, around: Floats) -> SceneRaster:
+def crop(raster: Raster, around: Floats) -> Raster:
     """Return the part of a map that some agents can see, on the same pixel grid.
 
     Off the map this is one empty pixel: beyond the edge of a map nothing is driveable, while without a map
@@ -87,4 +87,9 @@ def crop(raster: Raster, around: Floats) -> SceneRaster:
     part = raster.layers[:, low[0] : high[0], low[1] : high[1]]
     if not part.size:
         part = np.zeros((len(part), 1, 1), dtype=np.uint8)
-    return scene_raster(part != 0, (raster.origin + low / scale).tolist(), scale)
+    return Raster(part, raster.origin + low / scale, scale)
+
+
+def raster_message(raster: Raster) -> SceneRaster:
+    """Return a map as the message of a request."""
+    return scene_raster(raster.layers != 0, raster.origin.tolist(), raster.pixels_per_meter)

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from benchmark.hard_cases import CaseForecast, HardCase
 from benchmark.report.canvas import FRAME, Style, grid, plain
-from benchmark.requests import crop
+from benchmark.requests import crop, raster_message
 from cab.forecast.v1.prediction_service_pb2 import PredictRequest
 from cab_forecast.plot import GROUND, INK, draw_map
 from model.arrays import Floats
@@ -35,7 +35,7 @@ def case_map(case: HardCase, styles: Mapping[str, Style]) -> Figure:
     size = _PANEL if count >= _PANELS_A_ROW else _LARGE_PANEL
     figure, panels = grid(count, _PANELS_A_ROW, size, size)
     low, high = _view(case)
-    request = PredictRequest(scene_raster=crop(case.raster, np.stack([low, high])))
+    request = PredictRequest(scene_raster=raster_message(crop(case.raster, np.stack([low, high]))))
     for axes in panels:
         _ground(axes, request, low, high)
         _agent(axes, case)
