@@ -75,7 +75,7 @@ class Difference:
 
     @property
     def clear(self) -> bool | None:
-        """Whether the difference exceeds two standard errors and its interval, if known, excludes 0; None:
+        """True if the difference exceeds two standard errors and its interval, if known, excludes 0; None:
         unknown."""
         if math.isnan(self.standard_error) or math.isnan(self.difference):
             return None

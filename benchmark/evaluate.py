@@ -172,7 +172,7 @@ def consistency_metrics(
 
 @dataclass(frozen=True)
 class _Work:
-    """What a process needs to evaluate any scene."""
+    """Evaluation of one scene in any process: a function that can be pickled."""
 
     folder: Path
     models: tuple[str, ...]
@@ -281,7 +281,13 @@ class _Totals:
                 values[scene.instances] = scene.metrics[name]
 
     def result(self, model: Model | None, mismatch_m: Floats | None) -> BenchmarkModelResult:
-        """Return the result of a model; None: of the physics oracle."""
+        """Return the result of a model.
+
+        Args:
+            model: the model; None: the physics oracle.
+            mismatch_m: [pairs], m, FDE at 6 s of the Kalman filter, which ranks the hard cases; None: it was
+                not evaluated.
+        """
         metrics = self.means.figures() | self.instants.means()
         if mismatch_m is not None and _FDE in self.each:
             metrics |= hardest_fde(self.each[_FDE], mismatch_m)

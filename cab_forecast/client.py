@@ -37,9 +37,9 @@ from cab_forecast.connection import (
     DEFAULT_TIMEOUT,
     AsyncTransport,
     ClientSettings,
+    Connection,
     Encoding,
-    open_async_transport,
-    open_transport,
+    Transport,
 )
 from cab_forecast.endpoints import DEFAULT_ENDPOINT
 from cab_forecast.streams import AsyncStream, OpenStream, Stream
@@ -79,7 +79,7 @@ class Client:
             OSError: the certificates cannot be read.
         """
         self._settings = ClientSettings(endpoint, token, timeout, retries, encoding=encoding, ca_file=ca_file)
-        self._transport = open_transport(self._settings.connection)
+        self._transport = _connect(self._settings.connection)
 
     def predict(self, request: PredictRequest, timeout: float | None = None) -> PredictResponse:
         """Forecast the agents of a scene.
@@ -311,7 +311,7 @@ class AsyncClient:
 
     def _open_transport(self) -> AsyncTransport:
         if self._transport is None:
-            self._transport = open_async_transport(self._settings.connection)
+            self._transport = _connect_async(self._settings.connection)
         return self._transport
 
     def _retrying(self, budget: Budget) -> tenacity.AsyncRetrying:
@@ -324,3 +324,26 @@ def _get_model_request(name: str) -> GetModelRequest:
     if not name:  # it would be the path of the list
         raise ValueError("the model's name is empty")
     return GetModelRequest(name=name)
+
+
+def _connect(connection: Connection) -> Transport:
+    """Return the transport for an endpoint."""
+    # Imported here, so that users of one transport do not load the other.
+    if connection.endpoint.transport == "grpc":
+        from cab_forecast.grpc_transport import GrpcTransport  # noqa: PLC0415
+
+        return GrpcTransport(connection)
+    from cab_forecast.rest_transport import RestTransport  # noqa: PLC0415
+
+    return RestTransport(connection)
+
+
+def _connect_async(connection: Connection) -> AsyncTransport:
+    """Return the transport for an endpoint, for asyncio."""
+    if connection.endpoint.transport == "grpc":
+        from cab_forecast.grpc_transport import AsyncGrpcTransport  # noqa: PLC0415
+
+        return AsyncGrpcTransport(connection)
+    from cab_forecast.rest_transport import AsyncRestTransport  # noqa: PLC0415
+
+    return AsyncRestTransport(connection)

@@ -19,7 +19,7 @@ Encoding = Literal["protobuf", "json"]
 
 @dataclass(frozen=True)
 class Connection:
-    """Everything that a transport needs to reach a server."""
+    """The server to reach, and how: the settings that transports share."""
 
     endpoint: Endpoint
     token: str | None
@@ -115,26 +115,3 @@ class ClientSettings:
         if self.closed:
             raise RuntimeError("this client is closed")
         return Budget(self.timeout if timeout is None else timeout)
-
-
-def open_transport(connection: Connection) -> Transport:
-    """Return the transport for an endpoint."""
-    # Imported here, so that users of one transport do not load the other.
-    if connection.endpoint.transport == "grpc":
-        from cab_forecast.grpc_transport import GrpcTransport  # noqa: PLC0415
-
-        return GrpcTransport(connection)
-    from cab_forecast.rest_transport import RestTransport  # noqa: PLC0415
-
-    return RestTransport(connection)
-
-
-def open_async_transport(connection: Connection) -> AsyncTransport:
-    """Return the transport for an endpoint, for asyncio."""
-    if connection.endpoint.transport == "grpc":
-        from cab_forecast.grpc_transport import AsyncGrpcTransport  # noqa: PLC0415
-
-        return AsyncGrpcTransport(connection)
-    from cab_forecast.rest_transport import AsyncRestTransport  # noqa: PLC0415
-
-    return AsyncRestTransport(connection)

@@ -251,7 +251,7 @@ def _draw_ellipses(axes: Axes, mean: _Floats, covariance: _Floats, color: str, s
 
 
 def _pointed_box(center: _Floats, heading: float, length: float, width: float) -> _Floats:
-    """Return the corners of a box with a slightly pointed front, which shows its heading: [5, 2]."""
+    """Return the corners of a box with a slightly pointed front, which shows its heading: [5, 2], m."""
     half = np.array([length, width]) / 2
     corners = np.array([(1.0, 0.0), (0.72, 1.0), (-1.0, 1.0), (-1.0, -1.0), (0.72, -1.0)]) * half
     cos, sin = math.cos(heading), math.sin(heading)

@@ -244,7 +244,7 @@ def _seconds(step: int, response: PredictResponse) -> str:
 
 
 def _note(view: Forecast, response: PredictResponse) -> str:
-    """Return why an agent's status is not OK, and the fallback model."""
+    """Return a line of rich markup: the agent, its status, the fallback model, and the reason."""
     other = view.model.name and view.model != response.model and view.model.name not in view.detail
     used = f" by {model_name(view.model)}" if other else ""
     detail = f"{view.field}: {view.detail}" if view.field not in view.detail else view.detail

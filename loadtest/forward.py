@@ -107,29 +107,42 @@ def features_in_agent_frame(agents: int) -> Features:
 
 
 def main() -> None:
-    """Print the table; both networks alternate, so that other load on the machine affects them equally."""
-    models = {frame: cab_network(frame) for frame in Frame}
-    model = models[Frame.GROUND]
+    """Print the table; the networks alternate, so that other load on the machine affects them equally."""
+    served = cab_network(Frame.AGENT)
+    if not served.compile(torch.get_num_threads()):
+        raise RuntimeError("the network in the agent's frame has no graph")
+    models = (
+        ("ground, PyTorch", Frame.GROUND, cab_network(Frame.GROUND)),
+        ("agent, PyTorch", Frame.AGENT, cab_network(Frame.AGENT)),
+        ("agent, ONNX Runtime", Frame.AGENT, served),
+    )
     left, right = torch.randn(_MATRIX, _MATRIX), torch.randn(_MATRIX, _MATRIX)
     table = Table(
-        title=f"full forward, K = {model.info.modes}, T = {model.info.steps}; "
+        title=f"full forward, K = {served.info.modes}, T = {served.info.steps}; "
         f"{torch.get_num_threads()} threads, torch {torch.__version__}, {platform.machine()}"
     )
-    for column in ("vehicles", "frame", "ms", "agents/s", "fp32 matmul, GFLOP/s", "share of matmul rate"):
+    for column in (
+        "vehicles",
+        "frame, engine",
+        "ms",
+        "agents/s",
+        "fp32 matmul, GFLOP/s",
+        "share of matmul rate",
+    ):
         table.add_column(column, justify="right")
     for agents in AGENTS:
         batches = {Frame.GROUND: features(agents), Frame.AGENT: features_in_agent_frame(agents)}
         forwards = [
-            partial(models[frame].forecast, batches[frame], AgentType.VEHICLE, Context.FULL)
-            for frame in Frame
+            partial(model.forecast, batches[frame], AgentType.VEHICLE, Context.FULL)
+            for _, frame, model in models
         ]
         *seconds, product = paired_seconds(*forwards, partial(torch.matmul, left, right))
         rate = 2 * _MATRIX**3 / product
-        for frame, one in zip(Frame, seconds, strict=True):
+        for (label, frame, _), one in zip(models, seconds, strict=True):
             share = agents * FLOP_PER_AGENT[frame] / one / rate
             table.add_row(
                 str(agents),
-                frame.value,
+                label,
                 f"{1e3 * one:.1f}",
                 f"{agents / one:.0f}",
                 f"{rate / 1e9:.0f}",

@@ -170,7 +170,11 @@ def _parse_port(text: str) -> int:
 
 
 def _parse_path(layout: Layout, text: str) -> tuple[str, int]:
-    """Return the master's name and the database."""
+    """Return the master's name, "" without Sentinels, and the number of the database.
+
+    Raises:
+        ValueError: the path does not fit the layout.
+    """
     parts = text.removesuffix("/").split("/") if text else []
     if layout is Layout.CLUSTER:
         if any(parts):

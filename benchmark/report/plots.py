@@ -139,7 +139,7 @@ def _bars(
 
 
 def _curve(axes: Axes, figures: Mapping[str, float], names: Sequence[str], style: Style) -> Line2D:
-    """Draw figures of 1 … 6 s."""
+    """Draw the figures of these names, one for each of 1 … 6 s, as a curve, and return it."""
     values = [figures.get(name, math.nan) for name in names]
     (line,) = axes.plot(
         HORIZONS_S,

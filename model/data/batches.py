@@ -188,12 +188,12 @@ class JoinedPairs:
 
     @property
     def turned(self) -> Tensor:
-        """[P], as in ``Batches``."""
+        """``Batches.turned`` of all sources: [P], rad."""
         return torch.cat([one.turned for one in self._sources])
 
     @property
     def leaving(self) -> Tensor:
-        """[P], as in ``Batches``."""
+        """``Batches.leaving`` of all sources: [P] bool."""
         return self._leaving
 
     @property

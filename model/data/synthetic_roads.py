@@ -353,13 +353,20 @@ class Painter:
         self._draws[_DRIVEABLE].polygon(self._pixels(points), fill=value)
 
     def ribbon(self, line: Floats, right: float, left: float, value: int = 1) -> None:
-        """Fill the area between two distances d, m, from a line [L, 2]."""
+        """Fill the area along a line as driveable, or, with value 0, as not driveable.
+
+        Args:
+            line: [L, 2], m.
+            right: d of the right edge, m; d is the distance to the left of the line.
+            left: d of the left edge, m.
+            value: 1 or 0.
+        """
         every = int(_SPACING / STEP)
         coarse = np.concatenate([line[:-1:every], line[-1:]])
         self.area(np.concatenate([shifted(coarse, right), shifted(coarse, left)[::-1]]), value)
 
     def divider(self, layer: int, line: Floats) -> None:
-        """Draw a line [L, 2], m."""
+        """Draw a line [L, 2], m, into a layer: 1 road dividers, 2 lane dividers."""
         every = int(_SPACING / STEP)
         coarse = np.concatenate([line[:-1:every], line[-1:]])
         self._draws[layer].line(self._pixels(coarse), fill=1, width=_DIVIDER_PIXELS)

@@ -136,12 +136,16 @@ class Drives:
 
 @dataclass(frozen=True)
 class _Tables:
-    """The vehicles' lines side by side, [N, L], the last values repeated."""
+    """The vehicles' lines side by side, a point each ``STEP``: [N, L], the last values repeated."""
 
     place: Floats
+    """Distance along the line, m."""
     x: Floats
+    """m."""
     y: Floats
+    """m."""
     heading: Floats
+    """rad."""
     limit: Floats
     """m/s, for curves ahead and the end of the line."""
 

@@ -137,7 +137,10 @@ def instance_metrics(
 
 
 def _merged(mixture: TrajectoryMixture, truth: Floats) -> dict[str, Floats]:
-    """Return metrics of merged modes. Padding is harmless: it ranks last and repeats an existing mode."""
+    """Return metrics of the merged modes by name, [N] each; units as the names say.
+
+    The padding of merged mixtures is harmless: it ranks last and repeats an existing mode.
+    """
     merged = merge_modes(mixture).mixture
     likeliest = merged.most_likely_trajectory().numpy()
     result = _by_horizon("merged", displacement.displacement_m(likeliest, truth))

@@ -84,7 +84,7 @@ On {origin.reported}, {origin.protocol.value} protocol. {_choice(config, origin)
 
 
 def _network(config: TrainingConfig) -> str:
-    """Return the differences from the published network; empty if there are none."""
+    """Return the differences from the published network as a Markdown item; empty if there are none."""
     network = config.network
     if not (isinstance(network, NetworkConfig) and config.in_agent_frame):
         return ""

@@ -117,7 +117,11 @@ def clamped_divergence(log_q: Tensor, log_p: Tensor) -> Tensor:
 
 
 def mutual_information(log_prior: Tensor) -> Tensor:
-    """Return I(z; x) under the prior: entropy of the batch-mean p(z | x) minus the mean entropy: [], nats."""
+    """Return I(z; x) under the prior: entropy of the batch-mean p(z | x) minus the mean entropy: [], nats.
+
+    Args:
+        log_prior: [N, K], log p(z | x).
+    """
     prior = log_prior.exp()
     mean = prior.mean(dim=0)
     return -torch.xlogy(mean, mean).sum() + (prior * log_prior).sum(dim=-1).mean()

@@ -133,7 +133,7 @@ class _Entry:
 
     @property
     def finished(self) -> bool:
-        """Whether the entry has been cancelled or has failed meanwhile."""
+        """True if the entry has been cancelled or has failed meanwhile."""
         return self.done.done()
 
 

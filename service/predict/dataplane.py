@@ -30,7 +30,7 @@ _MAX_WORKERS = 8
 
 
 class DataPlane:
-    """Everything that transports call. Used on one event loop."""
+    """The interface of the transports to the server's work. Used on one event loop."""
 
     def __init__(self, settings: Settings, metrics: Metrics) -> None:
         self._settings = settings

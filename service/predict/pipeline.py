@@ -65,7 +65,7 @@ class Pipeline:
 
         Raises:
             Unavailable: the server is not ready.
-            Overloaded: the queue is full.
+            Overloaded: the queue is full, or the call would be late.
         """
         self._lifecycle.require_ready()
         limit = self._settings.max_timeout

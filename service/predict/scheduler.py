@@ -40,7 +40,7 @@ class Work(Protocol):
 
     @property
     def finished(self) -> bool:
-        """Whether the entry has been cancelled or has failed meanwhile."""
+        """True if the entry has been cancelled or has failed meanwhile."""
 
 
 AnyWork = TypeVar("AnyWork", bound=Work)
@@ -100,8 +100,7 @@ class DeadlineQueue(Generic[AnyWork]):
         Args:
             entry: the entry.
             lag: seconds by which it is ordered behind its deadline. Later parts of a large call lag behind
-            its
-                first, so that small calls which arrive meanwhile need not wait for all of them.
+                its first, so that small calls which arrive meanwhile need not wait for all of them.
         """
         insort(self._entries, (entry.deadline + lag, next(self._numbers), entry))
         self._agents[entry.key] += entry.agents

@@ -12,7 +12,7 @@ from tests.benchmark.scenes import PAIRS, planned
 
 
 def test_the_hardest_pairs_are_those_of_the_kalman_filter() -> None:
-    """Of 100 ranked pairs the 1, 2 and 3 worst; a pair without a rank is left out, one without FDE too."""
+    """The worst 1, 2 and 3 of 100 ranked pairs count; pairs without a rank or an FDE are left out."""
     mismatch_m = np.append(np.arange(100.0), np.nan)
     fde_m = np.append(np.zeros(97), [3.0, np.nan, 9.0, 1000.0])
     assert hardest_fde(fde_m, mismatch_m) == {

@@ -15,7 +15,7 @@ from model.forecaster import Protocol
 
 
 def model(name: str, version: str = "1.0.0", paper: bool = False) -> Model:
-    """As an endpoint lists it."""
+    """Return a model as an endpoint lists it."""
     protocol = INPUT_PROTOCOL_PAPER if paper else INPUT_PROTOCOL_CAUSAL
     return Model(name=name, version=version, protocol=protocol, agent_types=[AGENT_TYPE_VEHICLE], horizon=6.0)
 

@@ -222,7 +222,7 @@ def test_a_forecast_for_dispersion_alone_is_missed_too(tmp_path: Path, server: S
 
 
 def test_the_fallbacks_of_a_model_are_said(tmp_path: Path, server: Server) -> None:
-    """As if the server had said so of every pair."""
+    """The saved responses are changed as if every pair had been a fallback."""
     whole = made(tmp_path)
     chosen = ask(whole, f"grpc://{server.grpc_address}", "kalman")
     with Archive(tmp_path) as archive:

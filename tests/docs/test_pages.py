@@ -1,4 +1,4 @@
-"""What the documentation names exists: links, paths, make targets, commands, flags, settings, packages."""
+"""Existence of all that the documentation names: links, paths, make targets, commands, flags, settings."""
 
 import importlib
 import re

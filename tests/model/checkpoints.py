@@ -19,7 +19,7 @@ def info(
     version: str = "1.0.0",
     protocol: Protocol = Protocol.CAUSAL,
 ) -> ModelInfo:
-    """What fits the network."""
+    """Return the facts about a model that fit its network."""
     config = config or network()
     return ModelInfo(
         name=name,

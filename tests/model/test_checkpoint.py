@@ -39,7 +39,7 @@ def _rewrite(folder: Path, change: Callable[[dict[str, Tensor]], object]) -> Non
 
 
 def _fault(folder: Path, file: str) -> str:
-    """What loading the checkpoint and making its model finds wrong with that file."""
+    """Return the fault that loading the checkpoint and making its model finds in that file."""
     with pytest.raises(CheckpointError) as caught:
         load_checkpoint(folder).forecaster()
     assert caught.value.file == folder / file

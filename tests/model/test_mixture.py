@@ -190,13 +190,13 @@ def _fan(seed: int, agents: int = 3, modes: int = 8, steps: int = 6) -> Trajecto
 
 
 def _near(kept: Tensor, other: Tensor, min_distance_m: float = 2.0, relative_distance: float = 0.2) -> bool:
-    """Whether a path [T, 2] is within the allowance of a kept one at every step."""
+    """Return whether a path [T, 2] is within the allowance of a kept one at every step."""
     allowed = (relative_distance * torch.linalg.vector_norm(kept, dim=-1)).clamp_min(min_distance_m)
     return bool((torch.linalg.vector_norm(kept - other, dim=-1) <= allowed).all())
 
 
 def _leaders(weights: list[float], means: Tensor) -> dict[int, int]:
-    """Which mode each of one agent's modes joins, by the rule as it is told."""
+    """Return the mode that each of one agent's modes joins, by the documented rule."""
     leaders: dict[int, int] = {}
     for mode in sorted(range(len(weights)), key=lambda mode: -weights[mode]):
         kept = [leader for leader in leaders if leaders[leader] == leader]

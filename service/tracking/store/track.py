@@ -110,7 +110,10 @@ class Track:
         return reported
 
     def history(self, time: float, history_s: float) -> bytes:
-        """Return the observations of the last ``history_s`` seconds before a time, at least the last one."""
+        """Return the observations of the last ``history_s`` seconds before a time, at least the last one.
+
+        They are packed: see ``records.unpack_observations``.
+        """
         return self._observations.history(time, history_s)
 
     def snapshot(self, agent_id: str, window: float) -> Iterator[Instant]:

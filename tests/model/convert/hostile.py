@@ -26,7 +26,7 @@ class Hostile(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """Of reading a file: the error's class and message, and what it took beyond what was there."""
+    """Outcome of reading a file: the error's class and message, the time, and the additional memory."""
 
     name: str
     error: str

@@ -17,7 +17,7 @@ MAX_MEGABYTES = 256
 
 @pytest.fixture(scope="module")
 def outcomes(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Outcome]:
-    """Of all files by name, as far as the process came."""
+    """Return the outcomes of all files by name, up to the one at which the process ended."""
     folder = tmp_path_factory.mktemp("hostile")
     write(folder)
     run = subprocess.run(  # noqa: S603 - ourselves

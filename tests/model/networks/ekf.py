@@ -22,7 +22,7 @@ def _curved(state: Tensor, control: Tensor) -> Tensor:
 
 
 def _straight(state: Tensor, control: Tensor) -> Tensor:
-    """The same without turning."""
+    """Return the next state without turning."""
     (x, y, phi, v), (_, a), dt = state.unbind(), control.unbind(), STEP_SECONDS
     way = v * dt + a * dt**2 / 2
     return torch.stack([x + way * phi.cos(), y + way * phi.sin(), phi, v + a * dt])

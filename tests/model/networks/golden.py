@@ -42,5 +42,5 @@ def golden_features(file: Path, kind: AgentType) -> Features:
 
 
 def double(features: Features) -> Features:
-    """The same in float64."""
+    """Return the features in float64."""
     return {name: t.double() if t.is_floating_point() else t for name, t in features.items()}

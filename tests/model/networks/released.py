@@ -75,7 +75,7 @@ class _Step:
     rounded: Callable[[Tensor], Tensor]
 
     def straight(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Displacement by x and y, Jacobians by the state [4, 4] and the controls [4, 2]."""
+        """Return displacement by x and y, Jacobians by the state [4, 4] and the controls [4, 2]."""
         v, a, sin, cos = self.v, self.a, self.phi.sin(), self.phi.cos()
         way = v * DT + a / 2 * DT**2
         dx, dy = way * cos, way * sin
@@ -86,7 +86,7 @@ class _Step:
         return dx, dy, by_state, by_control
 
     def curved(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The same, turning."""
+        """Return what ``straight`` returns, for a turning vehicle."""
         v, w, a, after = self.v, self.w, self.a, self.phi + self.w * DT
         sin, cos, sin_after, cos_after = map(
             self.rounded, (self.phi.sin(), self.phi.cos(), after.sin(), after.cos())

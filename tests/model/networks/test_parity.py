@@ -210,7 +210,7 @@ def test_posterior_by_its_divergence_from_the_prior(
 def test_the_golden_rounding_is_the_golden_files_own(
     shared: Path, published: dict[AgentType, AgentNetwork]
 ) -> None:
-    """Why vehicles are compared as they are: the file is far from its own formulas, ours is near."""
+    """The golden file is far from its own formulas, our code is near: hence the way vehicles are compared."""
     folder = shared / "reference/golden/trajectron_nuscenes"
     c = case(
         published[AgentType.VEHICLE],

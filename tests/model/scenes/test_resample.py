@@ -380,7 +380,7 @@ def test_a_start_from_rest_comes_out(since: float) -> None:
 def test_two_hertz_at_any_age_is_not_fitted(
     age: float, lost: list[int], seed: int, derivatives: bool
 ) -> None:
-    """What comes at 2 Hz comes out as it was given, on the grid that ends with its newest state."""
+    """Observations at 2 Hz stay as they were given, on the grid that ends with the newest one."""
     rng = np.random.default_rng(seed)
     times = np.delete(at_rate(2, 6, NOW - age), lost)
     fields: dict[str, Path] = {"heading": lambda t: rng.normal(0, 0.3, len(t))}

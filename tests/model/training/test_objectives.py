@@ -189,13 +189,13 @@ def test_gradient_norms(golden: Golden, released: Released) -> None:
 
 @pytest.mark.parametrize("golden", ["cab", "reweight", "rubiz"], indirect=True)
 def test_losses_with_our_own_integration(golden: Golden) -> None:
-    """Where steps are clamped, the golden loss comes out without the reference's rounding, too."""
+    """Methods that clamp the steps reach the golden loss without the reference's rounding, too."""
     assert golden.compute().value.item() == pytest.approx(golden.loss, rel=1e-3)
 
 
 @pytest.mark.parametrize("golden", ["rubiz"], indirect=True)
 def test_rubiz_fuses_normalised_logits(golden: Golden) -> None:
-    """By the fused latents before the floor of their divergence, which hides them in ``kl_fused``."""
+    """The latents are compared before the floor of their divergence, which hides them in ``kl_fused``."""
     with torch.no_grad():
         full, blind = (
             context_terms(

@@ -63,6 +63,9 @@ class Script:
             keys: keys, all in one slot.
             arguments: arguments of the script.
 
+        Returns:
+            The script's reply, as redis-py decodes it.
+
         Raises:
             redis.exceptions.RedisError, OSError: Redis failed or cannot be reached.
         """
