@@ -14,6 +14,7 @@ from pathlib import Path
 _START_SECONDS = 120.0
 _STOP_SECONDS = 30.0
 _SETTING = "FORECAST_"
+_ANY_PORT = "127.0.0.1:0"
 
 
 @dataclass(frozen=True)
@@ -35,11 +36,15 @@ class Server:
 
 
 @contextmanager
-def serving(models: Path, **settings: object) -> Iterator[Server]:
+def serving(
+    models: Path, http: str = _ANY_PORT, grpc: str = _ANY_PORT, **settings: object
+) -> Iterator[Server]:
     """Run a server; settings in this process's environment do not reach it.
 
     Args:
         models: folder of its checkpoints; if it is empty, the server has the baselines only.
+        http: HOST:PORT of REST.
+        grpc: HOST:PORT of gRPC.
         settings: settings of ``service.settings.Settings``.
 
     Raises:
@@ -47,7 +52,7 @@ def serving(models: Path, **settings: object) -> Iterator[Server]:
     """
     environment = {name: value for name, value in os.environ.items() if not name.startswith(_SETTING)}
     environment |= {_SETTING + name.upper(): str(value) for name, value in settings.items()}
-    ports = ["--http", "127.0.0.1:0", "--grpc", "127.0.0.1:0"]
+    ports = ["--http", http, "--grpc", grpc]
     command = [sys.executable, "-m", "service", "serve", "--models", str(models), "--log-json", *ports]
     with tempfile.TemporaryDirectory(prefix="loadtest-") as folder:
         log = Path(folder) / "log"

@@ -1,0 +1,201 @@
+"""A measured server, its clients and the results so far: what all scenarios of a load test share."""
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Coroutine
+from contextlib import ExitStack, asynccontextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from loadtest.generator import Calls, Generator, Load, even, poisson
+from loadtest.redis_servers import HOST, free_port
+from loadtest.requests import Encoding, ForwardInProcess, Request, made_up_requests
+from loadtest.results import Observer, Result
+from loadtest.servers import Server, serving
+from loadtest.wire import Transport, Wire, connect
+from model.arrays import Floats
+
+CLIENTS = 16
+"""Clients of the closed loop that measures the peak."""
+
+_WARM_UP = 1.0
+"""Seconds of calls before the first run."""
+_NORMAL_CALLS = 3
+"""Number of successive calls that must be fast again."""
+_NORMAL_FACTOR = 1.5
+_NORMAL_SLACK = 0.005
+"""A call is as fast as before up to this factor of the usual p90, and so many seconds."""
+_MAX_RECOVERY = 30.0
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of a load test."""
+
+    models: Path
+    """Folder of the server's checkpoints."""
+    model: str = "cab"
+    agents: int = 32
+    seconds: float = 30.0
+    """Duration of a run."""
+    rate: float | None = None
+    """Offered calls/s; None: the scenario's share of the peak."""
+    peak: float | None = None
+    """Peak, calls/s; None: measured."""
+    peak_seconds: float = 5.0
+    """Seconds of each measurement of the peak."""
+    deadline: float | None = None
+    """Seconds from the scheduled time; None: the scenario's."""
+    transport: Transport = Transport.GRPC
+    encoding: Encoding = Encoding.PROTOBUF
+    """Encoding of the bodies; gRPC has protobuf only."""
+    poisson: bool = True
+    """Whether calls arrive at random times; False: at even intervals."""
+    grpc: str | None = None
+    """HOST:PORT of a running server's gRPC; None: a server is started."""
+    http: str | None = None
+    """HOST:PORT of a running server's REST."""
+    uploads: int = 300
+    """Number of slow uploads."""
+    half_headers: int = 1000
+    """Number of connections that never end their headers."""
+    settings: dict[str, str] = field(default_factory=dict)
+    """Settings of the started server."""
+
+
+class Session:
+    """A server under test, see ``opened``."""
+
+    def __init__(self, options: Options) -> None:
+        self.options = options
+        self.results: list[Result] = []
+        self.notes: list[str] = []
+        """Figures of the whole session."""
+        self._stack = ExitStack()
+        self._server: Server | None = None
+        self._grpc = options.grpc or f"{HOST}:{free_port()}"
+        self._http = options.http or f"{HOST}:{free_port()}"
+        self._usual = 0.0
+        self.requests: list[Request] = made_up_requests(options.model, options.agents, options.encoding)
+        self.forward = ForwardInProcess(options.models, options.model, self.requests)
+
+    @property
+    def http(self) -> str:
+        """HOST:PORT of the server's REST."""
+        return self._http
+
+    @property
+    def observer(self) -> Observer:
+        """View of the server's resources."""
+        return Observer(self._http, self._server.process.pid if self._server else None)
+
+    @property
+    def owns_server(self) -> bool:
+        """Whether this session started the server."""
+        return self.options.grpc is None and self.options.http is None
+
+    async def open(self) -> None:
+        """Start the server if necessary, connect, and warm up."""
+        if self.owns_server:
+            await self._start()
+        address = self._grpc if self.options.transport is Transport.GRPC else self._http
+        self.wire: Wire = connect(self.options.transport, address, self.options.encoding)
+        self.generator = Generator(self.wire, self.requests)
+        await self.generator.closed_loop(CLIENTS, _WARM_UP)
+        alone = await self.generator.closed_loop(1, _WARM_UP)
+        self._usual = float(np.quantile([call.seconds for call in alone.all], 0.9))
+
+    async def close(self) -> None:
+        """Disconnect, and stop the server if this session started it."""
+        if hasattr(self, "wire"):
+            await self.wire.close()
+        await asyncio.to_thread(self._stack.close)
+
+    async def restart(self) -> None:
+        """Stop the server with SIGTERM, and start another one on the same ports.
+
+        Raises:
+            RuntimeError: the server was not started by this session.
+        """
+        if not self.owns_server:
+            raise RuntimeError("only a server that the load test has started can be restarted")
+        await asyncio.to_thread(self._stack.close)
+        await self._start()
+
+    def arrivals(self, rate: float, seconds: float, start: float = 0.0) -> Floats:
+        """Return the times of calls at a rate."""
+        return (poisson if self.options.poisson else even)(rate, seconds, start)
+
+    async def peak(self) -> float:
+        """Return the peak, calls/s: measured by a closed loop unless it is given."""
+        if self.options.peak is not None:
+            return self.options.peak
+        calls = await self.generator.closed_loop(CLIENTS, self.options.peak_seconds)
+        return sum(call.code == "OK" for call in calls.all) / calls.seconds
+
+    async def open_loop(self, name: str, load: Load, peak: float = 0.0) -> Result:
+        """Run a load and add its result.
+
+        Args:
+            name: name of the run.
+            load: the load.
+            peak: calls/s of the closed loop; 0: not measured.
+        """
+        return await self.measure(name, self.generator.open_loop(load), peak)
+
+    async def measure(self, name: str, run: Coroutine[None, None, Calls], peak: float = 0.0) -> Result:
+        """Run anything that calls, compare a sample of its answers with the forward, and add its result."""
+        before = await asyncio.to_thread(self.observer.usage)
+        calls = await run
+        after = await asyncio.to_thread(self.observer.usage)
+        result = Result(name, calls, before, after, peak)
+        await asyncio.to_thread(self._check, result)
+        self.results.append(result)
+        return result
+
+    async def recover(self, result: Result) -> None:
+        """Call until calls are as fast as before the result's run, and note how long that takes."""
+        begin, limit = time.perf_counter(), _NORMAL_FACTOR * self._usual + _NORMAL_SLACK
+        normal, since = 0, begin
+        while normal < _NORMAL_CALLS:
+            if time.perf_counter() - begin > _MAX_RECOVERY:
+                result.problems.append(f"calls were not as fast as before within {_MAX_RECOVERY:g} s")
+                return
+            since = time.perf_counter() if normal == 0 else since
+            [call] = (await self.generator.closed_loop(1, 0)).all
+            normal = normal + 1 if call.code == "OK" and call.seconds <= limit else 0
+        result.normal_after = since - begin
+
+    async def raw_rate(self, seconds: float) -> float:
+        """Return the best rate of the raw forward in this process, calls/s; the server must be idle."""
+        settings = self.options.settings
+        threads = int(settings["threads"]) if "threads" in settings else None
+        rate = await asyncio.to_thread(
+            self.forward.best_rate, settings.get("engine", "onnxruntime"), threads, seconds
+        )
+        return rate / self.options.agents
+
+    def _check(self, result: Result) -> None:
+        sample = [call for call in result.calls.all if call.body]
+        faults = (self.forward.fault(call.request, call.body, self.options.encoding) for call in sample)
+        result.checked = len(sample)
+        result.wrong = [fault for fault in faults if fault]
+        for call in sample:
+            call.body = b""
+
+    async def _start(self) -> None:
+        context = serving(self.options.models, self._http, self._grpc, **self.options.settings)
+        self._server = await asyncio.to_thread(self._stack.enter_context, context)
+
+
+@asynccontextmanager
+async def opened(options: Options) -> AsyncIterator[Session]:
+    """Open a session for the time of a block."""
+    session = Session(options)
+    try:
+        await session.open()
+        yield session
+    finally:
+        await session.close()
