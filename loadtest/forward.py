@@ -112,9 +112,9 @@ def main() -> None:
     if not served.compile(torch.get_num_threads()):
         raise RuntimeError("the network in the agent's frame has no graph")
     models = (
-        ("ground, PyTorch", Frame.GROUND, cab_network(Frame.GROUND)),
-        ("agent, PyTorch", Frame.AGENT, cab_network(Frame.AGENT)),
-        ("agent, ONNX Runtime", Frame.AGENT, served),
+        ("ground", Frame.GROUND, cab_network(Frame.GROUND)),
+        ("agent", Frame.AGENT, cab_network(Frame.AGENT)),
+        ("agent, ONNX", Frame.AGENT, served),
     )
     left, right = torch.randn(_MATRIX, _MATRIX), torch.randn(_MATRIX, _MATRIX)
     table = Table(
@@ -123,7 +123,7 @@ def main() -> None:
     )
     for column in (
         "vehicles",
-        "frame, engine",
+        "network",
         "ms",
         "agents/s",
         "fp32 matmul, GFLOP/s",
