@@ -7,32 +7,25 @@ do not depend on it.
 OUTSIDE: dict[str, frozenset[str]] = {
     "row": frozenset(
         {
-            "standing, 1 cm, 5 Hz",
+            "standing, headings 3 cm",
             "sideways 2 cm/s, 2 Hz",
             "sideways -2 cm/s",
-            "straight 9",
-            "straight 12, 20 Hz",
-            "straight 9, 8 cm, 20 Hz",
+            "timestamps 30 ms off",
             "highway 37",
+            "accelerating 1.7",
             "accelerating 2.2",
-            "junction in 22 m",
+            "curve 62",
             "junction in 30 m",
-            "lead in 24 m",
             "lead in 29 m",
         }
     ),
     "width": frozenset(),
-    "modes": frozenset(
-        {
-            "braking 2.7",
-        }
-    ),
+    "modes": frozenset(),
     "shared row": frozenset(
         {
             "standing_sideways_2cms",
-            "highway_33",
             "accelerating_2",
-            "curve_R55_entry",
+            "junction_8_at_25m",
             "lead_stands",
         }
     ),
