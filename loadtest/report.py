@@ -29,7 +29,7 @@ class Report:
 
     @property
     def failures(self) -> list[str]:
-        """What must not happen but did."""
+        """Events that must not happen but did."""
         return [failure for result in self.results for failure in result.failures]
 
     @property

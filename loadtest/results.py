@@ -170,7 +170,7 @@ class Result:
 
     @property
     def failures(self) -> list[str]:
-        """What must not happen but did."""
+        """Events that must not happen but did."""
         failures = [f"{self.name}: {problem}" for problem in self.problems]
         if self.counts["lost"]:
             codes = Counter(call.code for call in self.calls.all if self.outcome(call) == "lost")

@@ -93,7 +93,7 @@ class Session:
 
     @property
     def owns_server(self) -> bool:
-        """Whether this session started the server."""
+        """True if this session started the server."""
         return self.options.grpc is None and self.options.http is None
 
     async def open(self) -> None:
