@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from model.arrays import Ints
-from model.baselines.unimodal import require_observed, step_times, unimodal
+from model.baselines.unimodal import step_times, unimodal
 from model.forecaster import Context, Features, Forecaster, ModelInfo, Protocol
 from model.mixture import TrajectoryMixture
 from model.scenes.scene import STEP_SECONDS, AgentType, Scene
@@ -103,7 +103,7 @@ class Kalman(Forecaster):
             ValueError: a target is not observed now.
         """
         states = scene.states.last_frames(HISTORY_FRAMES)
-        require_observed(states, targets)
+        states.require_observed(targets)
         missing = HISTORY_FRAMES - states.frames
         origin = states.position[targets, -1]
         # Always five frames, even if the scene has fewer, so that agents of many scenes can be joined

@@ -16,7 +16,7 @@ from torch import Tensor
 from model.arrays import Ints
 from model.baselines import uncertainty
 from model.baselines.uncertainty import SpreadBySpeed, aligned_covariance
-from model.baselines.unimodal import require_observed, step_times, unimodal
+from model.baselines.unimodal import step_times, unimodal
 from model.forecaster import Context, Features, Forecaster, ModelInfo, Protocol
 from model.mixture import TrajectoryMixture
 from model.scenes.scene import AgentType, Scene
@@ -80,7 +80,7 @@ class Physics(Forecaster):
             ValueError: a target is not observed now.
         """
         states = scene.states
-        require_observed(states, targets)
+        states.require_observed(targets)
         return {
             "position": torch.from_numpy(states.position[targets, -1]),
             "velocity": torch.from_numpy(np.nan_to_num(states.velocity[targets, -1])),

@@ -3,25 +3,9 @@
 import torch
 from torch import Tensor
 
-from model.arrays import Ints
 from model.forecaster import ModelInfo
 from model.mixture import TrajectoryMixture
-from model.scenes.scene import STEP_SECONDS, AgentStates
-
-
-def require_observed(states: AgentStates, targets: Ints) -> None:
-    """Refuse agents that are not observed now.
-
-    Args:
-        states: states of the scene's agents.
-        targets: [n], indices of agents.
-
-    Raises:
-        ValueError: a target is not observed now.
-    """
-    absent = targets[states.first[targets] >= states.frames]
-    if len(absent):
-        raise ValueError(f"agents {absent.tolist()} are not observed now, so they cannot be forecast")
+from model.scenes.scene import STEP_SECONDS
 
 
 def step_times(info: ModelInfo, steps: int | None) -> Tensor:

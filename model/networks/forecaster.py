@@ -9,7 +9,6 @@ import torch
 from torch import Tensor, nn
 
 from model.arrays import Ints
-from model.baselines.unimodal import require_observed
 from model.features.scene_features import network_features
 from model.features.spec import Frame
 from model.forecaster import Context, Features, Forecaster, ModelInfo
@@ -75,6 +74,7 @@ class NetworkForecaster(Forecaster, Generic[SomeNetworks]):
         with torch.device("meta"):  # skips the initialisation, since the tensors replace all parameters
             self.networks = make()
         self.config = self.networks.config
+        self._spec = self.config.features
         _check(dict(self.networks.state_dict()), tensors)
         self.networks.load_state_dict(dict(tensors), assign=True)
         self.networks.eval().requires_grad_(False)
@@ -108,12 +108,10 @@ class NetworkForecaster(Forecaster, Generic[SomeNetworks]):
     def prepare(self, scene: Scene, targets: Ints, context: Context = Context.FULL) -> Features:
         agent_type = scene.types[int(targets[0])]
         states = scene.states.last_frames(self.info.history_frames)
-        require_observed(states, targets)
+        states.require_observed(targets)
         if self.requires_heading(agent_type) and np.isnan(states.heading[targets, -1]).any():
             raise ValueError("an agent to be forecast has no heading")
-        return network_features(
-            replace(scene, states=states), targets, agent_type, self.config.features, context
-        )
+        return network_features(replace(scene, states=states), targets, agent_type, self._spec, context)
 
     @torch.inference_mode()
     def forecast(

@@ -67,6 +67,19 @@ class AgentStates:
             first=np.maximum(self.first - cut, 0),
         )
 
+    def require_observed(self, targets: Ints) -> None:
+        """Refuse agents that are not observed now.
+
+        Args:
+            targets: [n], indices of agents.
+
+        Raises:
+            ValueError: a target is not observed now.
+        """
+        absent = targets[self.first[targets] >= self.frames]
+        if len(absent):
+            raise ValueError(f"agents {absent.tolist()} are not observed now, so they cannot be forecast")
+
     def select(self, agents: Bools | Ints) -> "AgentStates":
         """Return some of the agents, by mask [N] or indices [n]."""
         return AgentStates(**{field.name: getattr(self, field.name)[agents] for field in fields(self)})

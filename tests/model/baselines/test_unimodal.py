@@ -5,17 +5,17 @@ import pytest
 import torch
 
 from model.baselines.kalman import Kalman
-from model.baselines.unimodal import require_observed, step_times, unimodal
+from model.baselines.unimodal import step_times, unimodal
 from tests.model.made_scenes import present, tracks
 
 
 def test_agents_that_are_not_observed_now_are_refused_by_index() -> None:
     states = tracks([[(0.0, 0.0), (1.0, 0.0)], [(5.0, 5.0)]], frames=2).states
-    require_observed(states, np.array([0, 1]))
+    states.require_observed(np.array([0, 1]))
     states.first[1] = 2
-    require_observed(states, np.array([0]))
+    states.require_observed(np.array([0]))
     with pytest.raises(ValueError, match=r"agents \[1\] are not observed now"):
-        require_observed(states, np.array([0, 1]))
+        states.require_observed(np.array([0, 1]))
 
 
 def test_steps_are_half_a_second_apart() -> None:
