@@ -9,7 +9,7 @@ PIP_FLAGS ?=
 PROTOC := PATH="$(CURDIR)/$(BIN):$$PATH" python -m grpc_tools.protoc
 PROTOS := $(wildcard proto/cab/forecast/v1/*.proto)
 
-.PHONY: install run test test-nuscenes bench faults lint format docs proto proto-check proto-lint lock clean
+.PHONY: install run test test-nuscenes bench loadtest faults lint format docs proto proto-check proto-lint lock clean
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -50,6 +50,9 @@ bench: install  ## measure the forward pass (relative to matmul), startup time, 
 	$(BIN)/python -m loadtest.forward
 	$(BIN)/python -m loadtest.startup
 	$(BIN)/python -m loadtest.tracking
+
+loadtest: install  ## short load tests of all scenarios: overload, a restart, slow uploads … (a few minutes)
+	$(BIN)/python -m loadtest all --seconds 10 --out build/loadtest
 
 faults: install  ## forecast while the track memory is killed, full, slow or hanging; needs redis-server
 	$(BIN)/python -m loadtest.redis_faults

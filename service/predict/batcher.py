@@ -13,7 +13,7 @@ from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequenc
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import NoReturn, TypeVar
 
 import structlog
 import torch
@@ -22,7 +22,13 @@ from model.forecaster import Context, Features, Forecaster, agent_count, join
 from model.mixture import TrajectoryMixture
 from model.scenes.scene import AgentType
 from service.errors import DeadlineExceeded, Internal, Overloaded, Unavailable
-from service.predict.scheduler import MAX_BATCH_SECONDS, MIN_BATCH_AGENTS, CostModel, DeadlineQueue
+from service.predict.scheduler import (
+    MAX_BATCH_SECONDS,
+    MIN_BATCH_AGENTS,
+    CostModel,
+    DeadlineQueue,
+    Throughput,
+)
 from service.predict.torch_threads import set_forward_threads
 from service.telemetry.metrics import Metrics
 
@@ -32,6 +38,9 @@ _T = TypeVar("_T")
 
 _MIN_RETRY = 0.05
 _MAX_RETRY = 10.0
+_USABLE = 0.8
+"""Share of the time until the deadline that a call may be expected to take when it is admitted; estimates may
+be wrong by the rest."""
 
 
 class Call:
@@ -46,6 +55,8 @@ class Call:
         """Deadline on the event loop's clock, s: the client's or the server's own, whichever is earlier."""
         self.started = time.perf_counter()
         """Start of the work for the call, by ``time.perf_counter``."""
+        self.helper_seconds = 0.0
+        """Seconds of work for the call in helper threads."""
         self.places = 0
         """Number of queue places held."""
         self.undecoded = 0
@@ -154,6 +165,7 @@ class Batcher:
         self._max_queue = max_queue_agents
         self._metrics = metrics
         self._costs = CostModel()
+        self._throughput = Throughput()
         self._queue: DeadlineQueue[_Entry] = DeadlineQueue(self._costs)
         self._running: list[_Entry] = []
         self._running_since = 0.0
@@ -207,7 +219,29 @@ class Batcher:
         """
         self._require_room(1)
         self._require_time(deadline, 0)
+        now = asyncio.get_running_loop().time()
+        expected = self._throughput.seconds_until(deadline)
+        if expected > _USABLE * (deadline - now):
+            self._refuse_as_late(expected, deadline - now)
         return Call(deadline)
+
+    @contextmanager
+    def in_progress(self, call: Call) -> Iterator[None]:
+        """Count a call as worked on, for the expected time of later calls.
+
+        Args:
+            call: the call; its request has been received.
+        """
+        loop = asyncio.get_running_loop()
+        self._throughput.begin(call.deadline, loop.time())
+        finished = False
+        try:
+            yield
+            finished = True
+        finally:
+            self._throughput.end(call.deadline, loop.time(), finished)
+            if finished:
+                self._costs.measure_around(call.helper_seconds)
 
     @contextmanager
     def hold_places(self, call: Call, agents: int) -> Iterator[None]:
@@ -407,11 +441,14 @@ class Batcher:
         needed = wait + self._costs.seconds_of_unknown(agents) + self._costs.around
         remaining = deadline - asyncio.get_running_loop().time()
         if needed > remaining:
-            self._metrics.refused.labels("late").inc()
-            raise Overloaded(
-                f"the forecast would take {needed:.2f} s, and the deadline is in {max(remaining, 0):.2f} s",
-                self._retry_after(),
-            )
+            self._refuse_as_late(needed, remaining)
+
+    def _refuse_as_late(self, needed: float, remaining: float) -> NoReturn:
+        self._metrics.refused.labels("late").inc()
+        raise Overloaded(
+            f"the forecast would take {needed:.2f} s, and the deadline is in {max(remaining, 0):.2f} s",
+            self._retry_after(),
+        )
 
     def _expected_wait(self, deadline: float) -> float:
         """Return the expected seconds until the model is free for a new call of that deadline; 0 if it is."""
@@ -420,15 +457,6 @@ class Batcher:
             running = sum(self._costs.seconds(entry.key, entry.agents) for entry in self._running)
             wait += max(running - self.forward_seconds, 1e-3)
         return wait
-
-    def measure_call(self, call: Call, in_batcher: float) -> None:
-        """Learn from a call that was answered how long it takes outside the batcher.
-
-        Args:
-            call: the call.
-            in_batcher: seconds that it spent in ``run``.
-        """
-        self._costs.measure_around(time.perf_counter() - call.started - in_batcher)
 
     def _retry_after(self) -> float:
         """Return the seconds until the work that is queued now should be done."""

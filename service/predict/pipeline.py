@@ -90,34 +90,32 @@ class Pipeline:
             with self.accept() as accepted:
                 return await self.predict(request, accepted)
         call.started = time.perf_counter()
-        async with call.in_time():
-            # Decode
-            message = await self._reader.read(request) if isinstance(request, EncodedRequest) else request
-            # Validate
-            forecaster = self.catalog.get(message.model)
-            options = read_options(message, forecaster.info, self._settings)
-            agents: Agents | None = None
-            recalled: TrackingResult | None = None
-            with self._batcher.hold_places(call, options.predicted):
-                # Recall
-                if options.recalls:
-                    agents, recalled = await self._recall(message, options, forecaster, call)
-                # Plan
-                plan = await self._in_thread(
-                    make_plan, message, options, forecaster, self.catalog, self._settings, agents
-                )
-                # Batch
-                queued = time.perf_counter()
-                await self._forecast(plan, call)
-                in_batcher = time.perf_counter() - queued
-            # Encode and remember; the track memory usually responds while the response is being encoded
-            encoding = self._in_thread(self._encode, plan, _seed(options))
-            if not options.scene_id:
-                response = await encoding
-            else:
-                response, stored = await asyncio.gather(encoding, self._remember(plan, recalled, call))
-                report(response, recalled, stored)
-        self._batcher.measure_call(call, in_batcher)
+        with self._batcher.in_progress(call):
+            async with call.in_time():
+                # Decode
+                message = await self._reader.read(request) if isinstance(request, EncodedRequest) else request
+                # Validate
+                forecaster = self.catalog.get(message.model)
+                options = read_options(message, forecaster.info, self._settings)
+                agents: Agents | None = None
+                recalled: TrackingResult | None = None
+                with self._batcher.hold_places(call, options.predicted):
+                    # Recall
+                    if options.recalls:
+                        agents, recalled = await self._recall(message, options, forecaster, call)
+                    # Plan
+                    plan = await self._in_thread(
+                        call, make_plan, message, options, forecaster, self.catalog, self._settings, agents
+                    )
+                    # Batch
+                    await self._forecast(plan, call)
+                # Encode and remember; the track memory usually responds while the response is being encoded
+                encoding = self._in_thread(call, self._encode, plan, _seed(options))
+                if not options.scene_id:
+                    response = await encoding
+                else:
+                    response, stored = await asyncio.gather(encoding, self._remember(plan, recalled, call))
+                    report(response, recalled, stored)
         self._count_agents(plan)
         return response
 
@@ -125,7 +123,7 @@ class Pipeline:
         self, request: pb.PredictRequest, options: Options, forecaster: Forecaster, call: Call
     ) -> tuple[Agents, TrackingResult]:
         """Return the agents with their histories from the track memory, and its response."""
-        agents = await self._in_thread(read_agents, request, self._settings)
+        agents = await self._in_thread(call, read_agents, request, self._settings)
         own = observation_updates(agents, (forecaster, self.catalog.fallback))
         tracked = await self._tracker.exchange(
             options.scene_id,
@@ -142,14 +140,14 @@ class Pipeline:
         groups = list(plan.groups)
         while True:
             outcomes = await self._batcher.run([group.job for group in groups], call)
-            broken = await self._in_thread(set_outcomes, groups, outcomes)
+            broken = await self._in_thread(call, set_outcomes, groups, outcomes)
             if not broken:
                 break
             _log.error("forecasts not finite", model=plan.forecaster.info.name, agents=len(broken))
             for draft in broken:
                 if draft.forecaster is not None:
                     self._metrics.nonfinite.labels(draft.forecaster.info.name).inc()
-            groups = await self._in_thread(plan.replace_broken, broken)
+            groups = await self._in_thread(call, plan.replace_broken, broken)
         plan.check_strict()
 
     def _encode(self, plan: Plan, seed: int) -> pb.PredictResponse:
@@ -172,8 +170,17 @@ class Pipeline:
             text = pb.ForecastStatus.Name(status).removeprefix("FORECAST_STATUS_").lower()
             self._metrics.agents.labels(name, text).inc(count)
 
-    async def _in_thread(self, function: Callable[..., _T], *arguments: object) -> _T:
-        return await asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)
+    async def _in_thread(self, call: Call, function: Callable[..., _T], *arguments: object) -> _T:
+        """Run a function in a helper thread, and count its time as the call's."""
+
+        def timed() -> _T:
+            started = time.perf_counter()
+            try:
+                return function(*arguments)
+            finally:
+                call.helper_seconds += time.perf_counter() - started
+
+        return await asyncio.get_running_loop().run_in_executor(self._threads, timed)
 
 
 def _seed(options: Options) -> int:

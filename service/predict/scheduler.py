@@ -8,7 +8,7 @@ model's time.
 
 import itertools
 import math
-from bisect import bisect_right, insort
+from bisect import bisect_left, bisect_right, insort
 from collections import Counter
 from collections.abc import Hashable, Iterator
 from typing import Generic, Protocol, TypeVar
@@ -16,6 +16,8 @@ from typing import Generic, Protocol, TypeVar
 _FIRST_RATE = 500.0
 """agents/s; a guess until the first batch has been measured."""
 _SMOOTHING = 0.2
+_KEPT = 0.95
+"""Weight of earlier answers in the throughput: about the last twenty count."""
 MAX_BATCH_SECONDS = 0.05
 """Seconds that a batch may be expected to take, so that a call with a deadline of 100 ms never finds the
 model busy for longer."""
@@ -47,36 +49,93 @@ AnyWork = TypeVar("AnyWork", bound=Work)
 
 
 class CostModel:
-    """Smoothed rates of forwards, by the key of what shares them, and the time around them."""
+    """Smoothed rates of forwards, by the key of what shares them and by size, and the time around them.
+
+    A forward of one agent takes far more than a hundredth of one of a hundred, so each power of two has its
+    own rate.
+    """
 
     def __init__(self) -> None:
-        self._rates: dict[Hashable, float] = {}
-        self._last_rate = _FIRST_RATE
+        self._rates: dict[Hashable, dict[int, float]] = {}
+        self._last_key: Hashable = None
         self.around = 0.0
-        """Smoothed seconds of a call outside queue and model: decoding, planning and encoding."""
+        """Smoothed seconds of work for a call outside the model: planning and encoding."""
 
     def seconds(self, key: Hashable, agents: int) -> float:
         """Return the expected seconds of a forward of so many agents."""
-        return agents / self._rates.get(key, self._last_rate)
+        return agents / self._rate(key, agents)
 
     def seconds_of_unknown(self, agents: int) -> float:
         """Return the expected seconds of a forward by a model that is not known yet."""
-        return agents / self._last_rate
+        return self.seconds(self._last_key, agents)
 
     def agents_within(self, key: Hashable, seconds: float) -> int:
         """Return how many agents a forward takes in so many seconds."""
-        return int(seconds * self._rates.get(key, self._last_rate))
+        known = self._rates.get(key) or self._rates.get(self._last_key) or {0: _FIRST_RATE}
+        largest = max(known)
+        # The agents that each rate allows, of a size that has it; larger batches have that of the largest
+        fitting = ((size, int(seconds * rate)) for size, rate in known.items())
+        return max(agents if size == largest else min(agents, 2**size - 1) for size, agents in fitting)
 
     def measure(self, key: Hashable, agents: int, seconds: float) -> None:
         """Learn from a forward."""
         rate = agents / max(seconds, 1e-6)
-        known = self._rates.get(key)
-        self._rates[key] = rate if known is None else known + _SMOOTHING * (rate - known)
-        self._last_rate = self._rates[key]
+        known = self._rates.setdefault(key, {})
+        size = agents.bit_length()
+        known[size] = known.get(size, rate) + _SMOOTHING * (rate - known.get(size, rate))
+        self._last_key = key
 
     def measure_around(self, seconds: float) -> None:
         """Learn from a call that was answered."""
         self.around += _SMOOTHING * (max(seconds, 0.0) - self.around)
+
+    def _rate(self, key: Hashable, agents: int) -> float:
+        """Return the rate of the known size that is nearest, the larger one of two."""
+        known = self._rates.get(key) or self._rates.get(self._last_key)
+        if not known:
+            return _FIRST_RATE
+        size = agents.bit_length()
+        return known[min(known, key=lambda one: (abs(one - size), -one))]
+
+
+class Throughput:
+    """Rate at which calls are finished, and the calls that are worked on.
+
+    It knows what the costs of forwards do not: that calls wait for the interpreter, for helper threads and
+    for busy neighbours. By Little's law a new call takes as long as the calls before it at that rate.
+    """
+
+    def __init__(self) -> None:
+        self._deadlines: list[float] = []
+        self._seconds = 0.0
+        self._calls = 0.0
+        self._since = 0.0
+
+    def begin(self, deadline: float, now: float) -> None:
+        """Begin a call."""
+        if not self._deadlines:
+            self._since = now
+        insort(self._deadlines, deadline)
+
+    def end(self, deadline: float, now: float, finished: bool) -> None:
+        """End a call.
+
+        Args:
+            deadline: its deadline.
+            now: the time.
+            finished: whether it was answered. The time of other calls counts as that of the next answer.
+        """
+        del self._deadlines[bisect_left(self._deadlines, deadline)]
+        if finished:
+            self._seconds = _KEPT * self._seconds + now - self._since
+            self._calls = _KEPT * self._calls + 1
+            self._since = now
+
+    def seconds_until(self, deadline: float) -> float:
+        """Return the expected seconds until a new call of that deadline is answered; 0 if nothing waits."""
+        if not self._deadlines or not self._calls:
+            return 0.0
+        return (bisect_right(self._deadlines, deadline) + 1) * self._seconds / self._calls
 
 
 class DeadlineQueue(Generic[AnyWork]):
@@ -131,6 +190,8 @@ class DeadlineQueue(Generic[AnyWork]):
         """Take the most urgent entry and what can share its forward, in order.
 
         A batch ends at the first entry of its key that does not fit, which nothing of that key may overtake.
+        Where all entries are expected to be late, the first one that is not yet late is taken anyway:
+        otherwise a wrong estimate could never be corrected.
 
         Args:
             now: the time on the clock of the deadlines, s.
@@ -160,6 +221,11 @@ class DeadlineQueue(Generic[AnyWork]):
                     limit = min(max_agents, max(within, MIN_BATCH_AGENTS))
                 batch.append(entry)
                 agents += entry.agents
+        if not batch:
+            possible = next((entry for entry in late if entry.deadline > now), None)
+            if possible is not None:
+                late.remove(possible)
+                batch.append(possible)
         self._entries = rest
         self._agents = Counter()
         for _, _, entry in rest:

@@ -6,7 +6,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.predict.scheduler import MAX_BATCH_SECONDS, MIN_BATCH_AGENTS, CostModel, DeadlineQueue
+from service.predict.scheduler import (
+    MAX_BATCH_SECONDS,
+    MIN_BATCH_AGENTS,
+    CostModel,
+    DeadlineQueue,
+    Throughput,
+)
 
 
 @dataclass(eq=False)
@@ -129,3 +135,45 @@ def test_every_entry_leaves_once_in_a_batch_or_as_late(
             break
     assert len(waiting) == 0
     assert sorted(map(id, left)) == sorted(id(entry) for entry in entries if not entry.finished)
+
+
+def test_each_size_has_its_own_rate_and_others_that_of_the_nearest() -> None:
+    model = CostModel()
+    model.measure("model", 1, 0.005)
+    model.measure("model", 32, 0.010)
+    assert model.seconds("model", 1) == pytest.approx(0.005)
+    assert model.seconds("model", 32) == pytest.approx(0.01)
+    assert model.seconds("model", 40) == pytest.approx(0.0125)
+    assert model.seconds("model", 320) == pytest.approx(0.1)
+    assert model.agents_within("model", 0.05) == 160
+    assert model.agents_within("new", 0.05) == 160
+
+
+def test_a_wrong_estimate_cannot_refuse_for_ever() -> None:
+    only = Entry(10.05, 100)
+    waiting = queue(only, rate=1.0)
+    assert waiting.take_batch(10.0, 256) == ([only], [])
+    past, possible = Entry(9.0, 100), Entry(10.05, 100)
+    assert queue(past, possible, rate=1.0).take_batch(10.0, 256) == ([possible], [past])
+
+
+def test_a_new_call_takes_as_long_as_those_before_it() -> None:
+    throughput = Throughput()
+    assert throughput.seconds_until(100.0) == 0  # nothing is known
+    for number in range(40):  # two at a time, one is answered every 10 ms
+        throughput.begin(10.0 + number, 0.01 * number)
+        if number:
+            throughput.end(9.0 + number, 0.01 * number + 0.005, finished=True)
+    assert throughput.seconds_until(100.0) == pytest.approx(0.02, rel=0.1)
+    assert throughput.seconds_until(20.0) == pytest.approx(0.01, rel=0.1)  # it goes before the other
+    throughput.end(49.0, 0.5, finished=False)
+    assert throughput.seconds_until(100.0) == 0  # nothing waits
+
+
+def test_time_without_calls_is_no_time_of_an_answer() -> None:
+    throughput = Throughput()
+    for start in (0.0, 100.0):
+        throughput.begin(start + 1, start)
+        throughput.end(start + 1, start + 0.2, finished=True)
+    throughput.begin(201.0, 200.0)
+    assert throughput.seconds_until(202.0) == pytest.approx(0.4)
