@@ -54,10 +54,21 @@ class Precision(StrEnum):
     FLOAT32 = "float32"
     BFLOAT16 = "bfloat16"
 
-    @property
-    def dtype(self) -> torch.dtype:
-        """The torch type."""
-        return torch.bfloat16 if self is Precision.BFLOAT16 else torch.float32
+    def dtype_on(self, device: torch.device) -> torch.dtype:
+        """Return the torch type on a device.
+
+        A CPU without instructions for bfloat16 emulates it, up to 16 times slower than float32; there it is
+        float32.
+        """
+        if self is Precision.FLOAT32 or (device.type == "cpu" and not _has_bfloat16()):
+            return torch.float32
+        return torch.bfloat16
+
+
+def _has_bfloat16() -> bool:
+    """Return whether the CPU computes in bfloat16."""
+    capabilities = torch.cpu.get_capabilities()
+    return any(capabilities.get(name, False) for name in ("avx512_bf16", "amx_bf16", "bf16"))
 
 
 def _renamed(old: str, new: str) -> AliasChoices:

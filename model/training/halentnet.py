@@ -43,7 +43,8 @@ class HalentLearner(CvaeLearner):
     def __init__(self, config: TrainingConfig, device: torch.device) -> None:
         super().__init__(config, device)
         self._adversarial_size = min(config.adversarial_batch_size, config.batch_size)
-        self.discriminator = Discriminator(STEPS, config.network.modes, config.precision.dtype).to(device)
+        dtype = config.precision.dtype_on(device)
+        self.discriminator = Discriminator(STEPS, config.network.modes, dtype).to(device)
         self.discriminator_optimizer = torch.optim.Adam(
             self.discriminator.parameters(), lr=DISCRIMINATOR_RATE, betas=BETAS
         )

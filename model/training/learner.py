@@ -18,7 +18,7 @@ from model.networks.decoder import ModeDecoder
 from model.networks.encoders import MapEncoder
 from model.networks.forecaster import CvaeNetworks, Networks
 from model.scenes.scene import AgentType
-from model.training.config import Method, Precision, TrainingConfig
+from model.training.config import Method, TrainingConfig
 from model.training.mixture_objective import mixture_objective
 from model.training.objectives import OBJECTIVES, Loss, LossWeights
 from model.training.processes import average_gradients
@@ -85,7 +85,7 @@ class DescentLearner(Learner):
 
     def __init__(self, config: TrainingConfig, networks: Networks[Any]) -> None:
         super().__init__(networks)
-        set_precision(networks, config.precision)
+        set_precision(networks, config.precision.dtype_on(next(networks.parameters()).device))
         scale_dropout(networks, config.dropout_factor)
         self.optimizer = torch.optim.AdamW(
             self._groups(), lr=config.learning_rate, weight_decay=config.weight_decay
@@ -183,11 +183,11 @@ def logged(loss: Loss) -> dict[str, Tensor]:
     return {"loss": loss.value.detach()} | {name: term.detach() for name, term in loss.terms.items()}
 
 
-def set_precision(networks: nn.Module, precision: Precision) -> None:
+def set_precision(networks: nn.Module, dtype: torch.dtype) -> None:
     """Set the training precision of every decoder and map encoder."""
     for module in networks.modules():
         if isinstance(module, ModeDecoder | MapEncoder):
-            module.training_dtype = precision.dtype
+            module.training_dtype = dtype
 
 
 def scale_dropout(networks: nn.Module, factor: float) -> None:

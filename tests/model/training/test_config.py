@@ -3,9 +3,17 @@
 from pathlib import Path
 
 import pytest
+import torch
 from pydantic import ValidationError
 
-from model.training.config import Method, MixtureWeights, TrainingConfig, TrainingError, load_config
+from model.training.config import (
+    Method,
+    MixtureWeights,
+    Precision,
+    TrainingConfig,
+    TrainingError,
+    load_config,
+)
 from tests.model.training.fakes import small_config
 
 OLD_NAMES = {
@@ -90,3 +98,13 @@ def test_a_name_that_no_setting_has_or_had_is_refused(tmp_path: Path) -> None:
 def test_a_fault_in_a_setting_under_its_old_name_is_named(tmp_path: Path) -> None:
     with pytest.raises(ValidationError, match="averaging"):
         small_config(Method.CAB, averaging=1.5)
+
+
+@pytest.mark.parametrize(("instructions", "expected"), [(True, torch.bfloat16), (False, torch.float32)])
+def test_a_cpu_without_bfloat16_trains_in_float32(
+    monkeypatch: pytest.MonkeyPatch, instructions: bool, expected: torch.dtype
+) -> None:
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx2": True, "avx512_bf16": instructions})
+    assert Precision.BFLOAT16.dtype_on(torch.device("cpu")) is expected
+    assert Precision.BFLOAT16.dtype_on(torch.device("cuda")) is torch.bfloat16
+    assert Precision.FLOAT32.dtype_on(torch.device("cpu")) is torch.float32
