@@ -88,7 +88,7 @@ class Result:
     wrong: list[str] = field(default_factory=list)
     """Faults of these answers."""
     normal_after: float | None = None
-    """Seconds from the end until calls were as fast as before; None: not measured."""
+    """Seconds from the end until calls were as fast as before; inf: they were not; None: not measured."""
     notes: list[str] = field(default_factory=list)
     """Further figures."""
     problems: list[str] = field(default_factory=list)

@@ -22,15 +22,13 @@ DEADLINES = (0.1, 1.0, None)
 """Deadlines of the overload, s."""
 USUAL_DEADLINE = 1.0
 """Deadline of the other scenarios, s."""
-RETRY_SECONDS = 10.0
-"""Seconds for which clients retry while the server restarts."""
 
 _UPLOAD_BYTES = 15_000_000
 _UPLOAD_PIECE = 2**16
 _PIECE_SECONDS = 1.0
 """Seconds between the pieces of an upload."""
 _PROBE_PERIOD = 0.2
-_MAX_PROBE_SECONDS = 1.0
+_PROBE_TIMEOUT = 10.0
 
 
 async def closed(session: Session) -> None:
@@ -127,7 +125,7 @@ async def restart(session: Session) -> None:
         session.arrivals(options.rate or 0.3 * peak, options.seconds),
         options.seconds,
         _deadline(session),
-        retry_for=RETRY_SECONDS,
+        retry_for=options.retry_seconds,
     )
 
     ready_after = 0.0
@@ -171,8 +169,8 @@ async def slow_uploads(session: Session) -> None:
         f"{options.uploads} uploads of {_UPLOAD_BYTES / 1e6:g} MB, {options.half_headers} half headers; "
         f"slowest of {len(probes)} probes {max(probes, default=math.inf):.2f} s"
     )
-    if not probes or max(probes) > _MAX_PROBE_SECONDS:
-        result.problems.append(f"a probe took longer than {_MAX_PROBE_SECONDS:g} s")
+    if not probes or max(probes) > options.max_probe_seconds:
+        result.problems.append(f"a probe took longer than {options.max_probe_seconds:g} s")
     await session.recover(result)
 
 
@@ -236,7 +234,7 @@ async def _probe(http: str, seconds: list[float]) -> None:
     while True:
         begin, status = time.perf_counter(), 0
         with suppress(OSError, EOFError, TimeoutError):
-            async with asyncio.timeout(10 * _MAX_PROBE_SECONDS), _connection(http) as (reader, writer):
+            async with asyncio.timeout(_PROBE_TIMEOUT), _connection(http) as (reader, writer):
                 writer.write(question)
                 status, _ = await read_head(reader)
         seconds.append(time.perf_counter() - begin if status == 200 else math.inf)

@@ -1,6 +1,7 @@
 """A measured server, its clients and the results so far: what all scenarios of a load test share."""
 
 import asyncio
+import math
 import time
 from collections.abc import AsyncIterator, Coroutine
 from contextlib import ExitStack, asynccontextmanager
@@ -20,14 +21,13 @@ from model.arrays import Floats
 CLIENTS = 16
 """Clients of the closed loop that measures the peak."""
 
-_WARM_UP = 1.0
-"""Seconds of calls before the first run."""
 _NORMAL_CALLS = 3
 """Number of successive calls that must be fast again."""
 _NORMAL_FACTOR = 1.5
 _NORMAL_SLACK = 0.005
 """A call is as fast as before up to this factor of the usual p90, and so many seconds."""
-_MAX_RECOVERY = 30.0
+_MAX_RECOVERY = 10.0
+"""Seconds after which it is given up to wait for fast calls."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,8 @@ class Options:
     """Peak, calls/s; None: measured."""
     peak_seconds: float = 5.0
     """Seconds of each measurement of the peak."""
+    warm_up: float = 1.0
+    """Seconds of calls before the first run, by many clients and by one."""
     deadline: float | None = None
     """Seconds from the scheduled time; None: the scenario's."""
     transport: Transport = Transport.GRPC
@@ -61,6 +63,10 @@ class Options:
     """Number of slow uploads."""
     half_headers: int = 1000
     """Number of connections that never end their headers."""
+    max_probe_seconds: float = 1.0
+    """Max time of a probe beside slow uploads."""
+    retry_seconds: float = 10.0
+    """Seconds for which clients retry while the server restarts."""
     settings: dict[str, str] = field(default_factory=dict)
     """Settings of the started server."""
 
@@ -92,6 +98,11 @@ class Session:
         return Observer(self._http, self._server.process.pid if self._server else None)
 
     @property
+    def grpc(self) -> str:
+        """HOST:PORT of the server's gRPC."""
+        return self._grpc
+
+    @property
     def owns_server(self) -> bool:
         """True if this session started the server."""
         return self.options.grpc is None and self.options.http is None
@@ -103,8 +114,8 @@ class Session:
         address = self._grpc if self.options.transport is Transport.GRPC else self._http
         self.wire: Wire = connect(self.options.transport, address, self.options.encoding)
         self.generator = Generator(self.wire, self.requests)
-        await self.generator.closed_loop(CLIENTS, _WARM_UP)
-        alone = await self.generator.closed_loop(1, _WARM_UP)
+        await self.generator.closed_loop(CLIENTS, self.options.warm_up)
+        alone = await self.generator.closed_loop(1, self.options.warm_up)
         self._usual = float(np.quantile([call.seconds for call in alone.all], 0.9))
 
     async def close(self) -> None:
@@ -161,7 +172,7 @@ class Session:
         normal, since = 0, begin
         while normal < _NORMAL_CALLS:
             if time.perf_counter() - begin > _MAX_RECOVERY:
-                result.problems.append(f"calls were not as fast as before within {_MAX_RECOVERY:g} s")
+                result.normal_after = math.inf
                 return
             since = time.perf_counter() if normal == 0 else since
             [call] = (await self.generator.closed_loop(1, 0)).all
