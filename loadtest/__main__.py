@@ -105,5 +105,8 @@ def main(
     raise typer.Exit(1 if report.failures else 0)
 
 
+app = typer.Typer(add_completion=False)
+app.command()(main)
+
 if __name__ == "__main__":
-    typer.run(main)
+    app()

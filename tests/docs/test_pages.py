@@ -10,6 +10,7 @@ import pytest
 import typer
 from typer.core import TyperGroup
 
+import loadtest.__main__
 from cli.main import app
 from docs import generate
 from model.networks.config import NetworkConfig
@@ -91,7 +92,8 @@ def test_commands_and_their_flags_exist(page: Path) -> None:
 
 @pages
 def test_flags_alone_exist(page: Path) -> None:
-    known = _every_flag(typer.main.get_group(app)) | _FOREIGN_FLAGS
+    load_test = _every_flag(typer.main.get_command(loadtest.__main__.app))
+    known = _every_flag(typer.main.get_group(app)) | load_test | _FOREIGN_FLAGS
     named = {flag for span in spans(page) for flag in re.findall(r"(?<![\w-])--[a-z][\w-]*", span)}
     assert named <= known
 
