@@ -137,6 +137,15 @@ class DeadlineExceeded(ServiceError):
     title = "Deadline exceeded"
 
 
+class RequestTimeout(ServiceError):
+    """Error of a call whose request did not arrive in time."""
+
+    code = "DEADLINE_EXCEEDED"
+    http_status = 408
+    reason = "REQUEST_TIMEOUT"
+    title = "Request timeout"
+
+
 class Unavailable(ServiceError):
     """Error of a call to a server that is not ready."""
 
@@ -212,6 +221,7 @@ TABLE: tuple[type[ServiceError], ...] = (
     TooLarge,
     Overloaded,
     DeadlineExceeded,
+    RequestTimeout,
     Unavailable,
     TrackingUnavailable,
     Internal,

@@ -16,6 +16,7 @@ from service.predict.dataplane import DataPlane
 from service.settings import Engine, Settings, SettingsError, bundled_models
 from service.telemetry.metrics import Metrics
 from service.transports.grpc.server import GrpcServer
+from service.transports.intake import Intake
 from service.transports.rest.server import HttpServer, build_app
 
 _log = structlog.get_logger(__name__)
@@ -46,8 +47,9 @@ class Server:
         self.metrics = Metrics()
         self.dataplane = DataPlane(settings, self.metrics)
         self._load = load or (lambda: _load_models(settings))
-        self._grpc = GrpcServer(self.dataplane, self.metrics, settings)
-        self._http = HttpServer(build_app(self.dataplane, self.metrics, settings), settings.http)
+        self.intake = Intake(settings, self.metrics)
+        self._grpc = GrpcServer(self.dataplane, self.metrics, settings, self.intake)
+        self._http = HttpServer(build_app(self.dataplane, self.metrics, settings, self.intake), settings)
         self._signalled = asyncio.Event()
         self._following: asyncio.Task[None] | None = None
 

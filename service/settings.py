@@ -79,6 +79,8 @@ class Settings(BaseSettings):
     """Max number of samples of an agent."""
     max_samples_per_call: int = Field(default=100_000, ge=1)
     """Max number of samples of all agents of a request."""
+    max_response_bytes: int = Field(default=32 * 2**20, ge=1024)
+    """Max size of the samples of a response, as protobuf; they take up to three times as much as JSON."""
 
     max_batch_agents: int = Field(default=256, ge=1)
     """Max number of agents in one forward."""
@@ -87,6 +89,21 @@ class Settings(BaseSettings):
     max_timeout: float = Field(default=30.0, gt=0)
     """Max duration of a call in seconds, whatever its own deadline. A forward that takes longer makes the
     server not ready."""
+    max_concurrent_calls: int = Field(default=1024, ge=1)
+    """Max number of calls in progress on both transports, from before their body is read until their response
+    has been sent; beyond it calls are refused as overload. Streams of events (``max_watchers``), health
+    checks, probes and metrics do not count. REST keeps at most twice as many connections, and closes those
+    without a request first."""
+    max_watchers: int = Field(default=64, ge=1)
+    """Max number of streams of events on both transports; with Redis each holds a connection to it."""
+    max_intake_bytes: int = Field(default=256 * 2**20, ge=2048)
+    """Max size of the bodies of all calls in progress, of both transports; bodies above 1 MiB may take three
+    quarters of it. REST counts a body when its length is known, or as it arrives; gRPC when it has arrived,
+    or as one of the largest size after a second."""
+    header_timeout: float = Field(default=10.0, gt=0)
+    """Seconds in which the headers of a REST request, or the handshake of a gRPC connection, must arrive."""
+    body_timeout: float = Field(default=10.0, gt=0)
+    """Seconds in which the body of a request must arrive."""
     drain_seconds: float = Field(default=10.0, ge=0)
     """Seconds that accepted calls get to finish when the server stops."""
     threads: int | None = Field(default=None, ge=1)
@@ -139,6 +156,20 @@ class Settings(BaseSettings):
                 "max_queue_agents must be at least max_agents, or a full request is never accepted"
             )
         return self
+
+    @model_validator(mode="after")
+    def _intake_takes_a_call(self) -> Self:
+        if self.max_large_intake_bytes < self.max_request_bytes:
+            raise ValueError(
+                "max_intake_bytes must be at least 4/3 of max_request_bytes, or a full request is never"
+                " accepted"
+            )
+        return self
+
+    @property
+    def max_large_intake_bytes(self) -> int:
+        """Share of ``max_intake_bytes`` that large bodies may take; the rest is left to small ones."""
+        return self.max_intake_bytes * 3 // 4
 
     @classmethod
     def settings_customise_sources(

@@ -55,7 +55,13 @@ class DataPlane:
         )
         metrics.registry.register(ConsistencyCollector(tracker.aggregates))
         self.consistency = ConsistencyService(
-            self._store, self._asking, tracker, self._references, self._lifecycle
+            self._store,
+            self._asking,
+            tracker,
+            self._references,
+            self._lifecycle,
+            settings.max_watchers,
+            metrics,
         )
         """Calls of the consistency service."""
         self._pipeline = Pipeline(settings, metrics, self._lifecycle, self._batcher, tracker, self._threads)

@@ -52,6 +52,7 @@ _RECALLS = {
 _FIELDS = [field.name for field in pb.AgentState.DESCRIPTOR.fields]
 _TIME, _X, _Y, _HEADING, _VX, _VY, _AX, _AY, _RATE = range(9)
 _REQUIRED = [_TIME, _X, _Y]
+_BYTES_PER_POINT = 16  # of a sample: x and y as double
 _PAIRS = [(_VX, _VY), (_AX, _AY)]
 _BOUNDS = np.array([FIELD_BOUNDS[f"AgentState.{name}"][1] for name in _FIELDS])  # of the absolute value
 _FIXED64 = 1  # wire type
@@ -151,9 +152,17 @@ def read_options(request: pb.PredictRequest, info: ModelInfo, settings: Settings
             "options.samples",
             f"{options.samples} × {predicted} agents; at most {settings.max_samples_per_call} in a call",
         )
+    steps = _steps(options, info)
+    size = options.samples * predicted * steps * _BYTES_PER_POINT
+    if size > settings.max_response_bytes:
+        raise BadField(
+            "options.samples",
+            f"{options.samples} × {predicted} agents × {steps} steps are {size} bytes; at most "
+            f"{settings.max_response_bytes} in a response",
+        )
     return Options(
         time=request.time,
-        steps=_steps(options, info),
+        steps=steps,
         context=context,
         max_modes=options.max_modes,
         merge=options.merge,

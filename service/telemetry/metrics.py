@@ -86,12 +86,13 @@ class Metrics:
         )
         self.refused = Counter(
             "forecast_refused_total",
-            "Calls refused as overload: the queue was full, or the forecast would have been late; and calls "
-            "dropped from the queue because they had become late.",
+            "Calls refused as overload: the queue was full, the forecast would have been late, or there were "
+            "too many calls, bytes of bodies or watchers; and calls dropped from the queue because they had "
+            "become late.",
             ["reason"],
             registry=self.registry,
         )
-        for reason in ("queue_full", "late", "dropped"):
+        for reason in ("queue_full", "late", "dropped", "concurrency", "bytes", "watchers"):
             self.refused.labels(reason)
         self.model_info = Gauge(
             "forecast_model_info",

@@ -7,12 +7,12 @@ from cab.forecast.v1 import consistency_service_pb2 as pb
 from cab.forecast.v1.bounds import MAX_ID_LENGTH
 from service.errors import BadField, Overloaded, TrackingUnavailable, UnknownTrack, id_too_long
 from service.lifecycle import Lifecycle
+from service.telemetry.metrics import Metrics
 from service.tracking.aggregates import Aggregates
 from service.tracking.messages import instant_messages, model_messages
 from service.tracking.metrics import InstantMetrics, instant_metrics
 from service.tracking.model_references import ModelReferences
 from service.tracking.store.base import WINDOW, SceneSnapshot, StoreError, TrackStore
-from service.tracking.store.factory import MAX_WATCHERS
 from service.tracking.store.guard import Guard
 from service.tracking.tracker import STORE_TIMEOUT, Tracker
 
@@ -33,6 +33,8 @@ class ConsistencyService:
         tracker: tracker of the Predict calls.
         references: references to models.
         lifecycle: lifecycle of the server.
+        max_watchers: max number of ``watch_scene`` calls.
+        metrics: counts those that are refused.
     """
 
     def __init__(
@@ -42,12 +44,16 @@ class ConsistencyService:
         tracker: Tracker,
         references: ModelReferences,
         lifecycle: Lifecycle,
+        max_watchers: int,
+        metrics: Metrics,
     ) -> None:
         self._store = store
         self._guard = guard
         self._tracker = tracker
         self._references = references
         self._lifecycle = lifecycle
+        self._max_watchers = max_watchers
+        self._metrics = metrics
         self._watchers = 0
         self._ended = asyncio.Event()
 
@@ -127,7 +133,8 @@ class ConsistencyService:
         """
         self._lifecycle.require_ready()
         _check_id("scene_id", request.scene_id)
-        if self._watchers >= MAX_WATCHERS:
+        if self._watchers >= self._max_watchers:
+            self._metrics.refused.labels("watchers").inc()
             raise Overloaded(f"{self._watchers} calls watch already", _WATCH_RETRY)
         self._watchers += 1
         source = self._store.watch(request.scene_id)

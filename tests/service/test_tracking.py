@@ -15,7 +15,6 @@ from cab.forecast.v1 import prediction_service_pb2 as pb
 from cab_forecast import AsyncClient, BadRequest, ForecastError, Overloaded, TrackingUnavailable, UnknownTrack
 from loadtest.redis_servers import free_port, single
 from service.server import Server
-from service.tracking.store.factory import MAX_WATCHERS
 from tests.nuscenes_pred import real_tracks
 from tests.service.fakes import FakeForecaster
 from tests.service.processes import process, ready
@@ -286,9 +285,9 @@ async def test_forecasts_go_on_without_the_memory() -> None:
 
 async def test_no_more_than_so_many_watch(server: Server) -> None:
     async with AsyncClient(server.grpc_address, timeout=30.0, retries=0) as client, AsyncExitStack() as stack:
-        for _ in range(MAX_WATCHERS):
+        for _ in range(server.settings.max_watchers):
             await stack.enter_async_context(client.watch_scene(scene_name()))
-        with pytest.raises(Overloaded, match=f"{MAX_WATCHERS} calls watch already"):
+        with pytest.raises(Overloaded, match="64 calls watch already"):
             async with client.watch_scene(scene_name()):
                 pass
 

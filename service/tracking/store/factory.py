@@ -5,8 +5,6 @@ from service.settings import Settings
 from service.tracking.store.base import TrackStore
 from service.tracking.store.memory import MemoryStore
 
-MAX_WATCHERS = 64
-"""Watchers per server; with Redis, each holds a connection."""
 _WATCH_TIMEOUT = 10.0
 """Seconds; a watcher's reads block in Redis for 2 s at most."""
 
@@ -23,5 +21,5 @@ def make_store(settings: Settings) -> TrackStore:
     client = connect(
         address, timeout_s=settings.store_timeout_ms / 1000, connections=settings.store_connections
     )
-    watch_client = connect(address, timeout_s=_WATCH_TIMEOUT, connections=MAX_WATCHERS)
+    watch_client = connect(address, timeout_s=_WATCH_TIMEOUT, connections=settings.max_watchers)
     return RedisStore(client, watch_client, settings.track_expiry, settings.max_tracked_agents)

@@ -16,12 +16,11 @@ from service.telemetry.metrics import Metrics
 from service.transports.auth import Tokens
 from service.transports.grpc.handlers import Handlers
 from service.transports.grpc.health import HEALTH_SERVICE, Health
+from service.transports.grpc.intake import RECEIVE_MARGIN, IntakeInterceptor
 from service.transports.grpc.status import abort
+from service.transports.intake import Intake
 
 _UNLIMITED = -1
-_RECEIVE_MARGIN = 2
-"""Factor on the request limit up to which messages are received, so that they are refused with error
-details. Beyond it gRPC itself refuses, with the same code but without details."""
 _KEEPALIVE = (
     # Detect within about a minute that a client has vanished; its streams would never end otherwise.
     ("grpc.keepalive_time_ms", 30_000),
@@ -36,12 +35,16 @@ _OPEN = ("/grpc.health.v1.Health/",)
 class GrpcServer:
     """The gRPC server, with the contract's services, health and reflection."""
 
-    def __init__(self, dataplane: DataPlane, metrics: Metrics, settings: Settings) -> None:
+    def __init__(self, dataplane: DataPlane, metrics: Metrics, settings: Settings, intake: Intake) -> None:
         self._settings = settings
         self._server = aio.server(
-            interceptors=[AuthInterceptor(Tokens(settings.api_tokens), metrics)],
+            interceptors=[
+                AuthInterceptor(Tokens(settings.api_tokens), metrics),
+                IntakeInterceptor(intake, metrics, settings),
+            ],
             options=[
-                ("grpc.max_receive_message_length", settings.max_request_bytes * _RECEIVE_MARGIN),
+                ("grpc.max_receive_message_length", settings.max_request_bytes * RECEIVE_MARGIN),
+                ("grpc.server_handshake_timeout_ms", max(round(settings.header_timeout * 1000), 1)),
                 ("grpc.max_send_message_length", _UNLIMITED),
                 ("grpc.so_reuseport", 0),  # otherwise a second server would silently share the port
                 *_KEEPALIVE,

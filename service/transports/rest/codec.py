@@ -14,7 +14,7 @@ import base64
 import functools
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, TypeVar
 
 import orjson
@@ -127,8 +127,25 @@ def read_request(body: bytes, limits: RequestLimits) -> pb.PredictRequest:
 
 
 def to_json(message: Message) -> bytes:
-    """Serialize a message to JSON."""
-    return orjson.dumps(to_dict(message), option=orjson.OPT_NON_STR_KEYS)
+    """Serialize a message to JSON.
+
+    The messages of a list, such as the forecasts of a response, are serialized one by one: orjson holds the
+    interpreter lock, for 0.2 s if it were to serialize a large response at once.
+    """
+    pieces: list[bytes] = []
+    separator = b"{"
+    fields: Sequence[Any] = message.DESCRIPTOR.fields  # typed differently by implementation
+    for field, (name, has_presence, encode) in zip(fields, _fields(message.DESCRIPTOR), strict=True):
+        if has_presence and not message.HasField(name):
+            continue
+        pieces += (separator, _dumps(name), b":")
+        separator = b","
+        if _is_message_list(field):
+            pieces += _list_pieces(getattr(message, name))
+        else:
+            pieces.append(_dumps(encode(getattr(message, name))))
+    pieces.append(b"}" if pieces else b"{}")
+    return b"".join(pieces)
 
 
 def to_dict(message: Message) -> dict[str, Any]:
@@ -142,6 +159,24 @@ def to_dict(message: Message) -> dict[str, Any]:
         if not has_presence or message.HasField(name):
             encoded[name] = encode(getattr(message, name))
     return encoded
+
+
+def _list_pieces(messages: Iterable[Message]) -> Iterator[bytes]:
+    separator = b"["
+    for message in messages:
+        yield separator
+        yield _dumps(to_dict(message))
+        separator = b","
+    yield b"]" if separator == b"," else b"[]"
+
+
+def _dumps(value: object) -> bytes:
+    return orjson.dumps(value, option=orjson.OPT_NON_STR_KEYS)
+
+
+def _is_message_list(field: FieldDescriptor) -> bool:
+    kind = field.message_type
+    return bool(field.is_repeated and kind is not None and not kind.GetOptions().map_entry)
 
 
 def _check_body(body: bytes, limits: RequestLimits) -> None:

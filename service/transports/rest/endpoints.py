@@ -13,13 +13,14 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from cab.forecast.v1.routes import MODEL_SERVICE, PREDICT, WATCH_SCENE, Route
-from service.errors import TooLarge
+from service.errors import RequestTimeout, TooLarge
 from service.predict.dataplane import DataPlane
 from service.predict.request_reader import LARGE_BYTES, EncodedRequest, RequestLimits, read_protobuf
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
 from service.transports.auth import Tokens
 from service.transports.calls import UNARY_METHODS, CallRecorder, parse_message, record_call
+from service.transports.intake import Intake
 from service.transports.rest.codec import parse_json, read_query, read_request, to_json
 from service.transports.rest.negotiation import (
     EVENT_STREAM,
@@ -49,7 +50,9 @@ Endpoint = Callable[[Request], Awaitable[Response]]
 class Endpoints:
     """The contract's methods as Starlette endpoints."""
 
-    def __init__(self, dataplane: DataPlane, metrics: Metrics, settings: Settings) -> None:
+    def __init__(self, dataplane: DataPlane, metrics: Metrics, settings: Settings, intake: Intake) -> None:
+        self._intake = intake
+        self._body_timeout = settings.body_timeout
         self._dataplane = dataplane
         self._metrics = metrics
         self._tokens = Tokens(settings.api_tokens)
@@ -73,6 +76,7 @@ class Endpoints:
             with record_call(self._metrics, "rest", route.method) as recorder:
                 try:
                     self._tokens.check(request.headers.get("authorization"))
+                    exit_stack(request).enter_context(self._intake.call())
                     response = await behavior(request)
                 except ClientDisconnect:
                     recorder.cancelled()
@@ -120,22 +124,31 @@ class Endpoints:
 
         return EventStreamResponse(self._metrics, self._tokens, WATCH_SCENE.method, request, events)
 
-    @staticmethod
-    async def _read_body(request: Request, max_bytes: int) -> bytes:
+    async def _read_body(self, request: Request, max_bytes: int) -> bytes:
         """Return the body; refuse one that is too large as soon as that is known.
 
         Raises:
             TooLarge: the body exceeds the limit, by its Content-Length or as it is received.
+            Overloaded: all bodies together exceed their budget.
+            RequestTimeout: the body did not arrive in time.
         """
         too_large = TooLarge(f"the body has more than {max_bytes} bytes")
         declared = request.headers.get("content-length", "")
         if declared.isdecimal() and int(declared) > max_bytes:
             raise too_large
+        reserved = exit_stack(request).enter_context(self._intake.body())
+        if declared.isdecimal():
+            reserved.grow(int(declared))
         body = bytearray()
-        async for chunk in request.stream():
-            body += chunk
-            if len(body) > max_bytes:
-                raise too_large
+        try:
+            async with asyncio.timeout(self._body_timeout):
+                async for chunk in request.stream():
+                    body += chunk
+                    if len(body) > max_bytes:
+                        raise too_large
+                    reserved.grow(len(body))
+        except TimeoutError as error:
+            raise RequestTimeout(f"the body did not arrive within {self._body_timeout:g} s") from error
         return bytes(body)
 
 

@@ -26,6 +26,7 @@ from service.errors import (
     NotAcceptable,
     NotFound,
     Overloaded,
+    RequestTimeout,
     ServiceError,
     TooLarge,
     TrackingUnavailable,
@@ -49,17 +50,17 @@ Errors are `application/problem+json` (RFC 9457), with a machine-readable `reaso
 
 _Errors = tuple[type[ServiceError], ...]
 
-_ALL_METHODS: _Errors = (Unauthenticated, NotAcceptable, Unavailable, Internal)
+_ALL_METHODS: _Errors = (Unauthenticated, NotAcceptable, Overloaded, Unavailable, Internal)
 """Errors that every method can return."""
 _ERRORS: dict[Route[Any, Any], _Errors] = {
-    PREDICT: (BadFields, UnknownModel, TooLarge, UnsupportedMediaType, Overloaded, DeadlineExceeded),
+    PREDICT: (BadFields, UnknownModel, TooLarge, UnsupportedMediaType, RequestTimeout, DeadlineExceeded),
     LIST_MODELS: (),
     GET_MODEL: (UnknownModel, NotFound, MethodNotAllowed),
     GET_AGENT_CONSISTENCY: (BadFields, UnknownTrack, TrackingUnavailable),
     GET_SCENE_CONSISTENCY: (BadFields, UnknownTrack, TrackingUnavailable),
     LIST_MODEL_CONSISTENCY: (BadFields,),
-    WATCH_SCENE: (BadFields, TrackingUnavailable, Overloaded),
-    RESET_SCENE: (BadFields, TooLarge, UnsupportedMediaType, TrackingUnavailable),
+    WATCH_SCENE: (BadFields, TrackingUnavailable),
+    RESET_SCENE: (BadFields, TooLarge, UnsupportedMediaType, RequestTimeout, TrackingUnavailable),
 }
 """Further errors of each method."""
 _RETRYABLE = (Overloaded, Unavailable, TrackingUnavailable)

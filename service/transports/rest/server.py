@@ -1,6 +1,8 @@
 """HTTP application and server."""
 
 import asyncio
+import functools
+import resource
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,6 +21,8 @@ from service.predict.dataplane import DataPlane
 from service.settings import Settings, split_address
 from service.telemetry.metrics import Metrics
 from service.transports.calls import to_service_error
+from service.transports.intake import Intake
+from service.transports.rest.connections import BoundedProtocol, Connections
 from service.transports.rest.endpoints import Endpoints, ExitStackMiddleware
 from service.transports.rest.openapi import openapi_document
 from service.transports.rest.problem import problem_response
@@ -30,13 +34,14 @@ _MIN_GRACE = 0.1
 _BACKLOG = 2048
 
 
-def build_app(dataplane: DataPlane, metrics: Metrics, settings: Settings) -> FastAPI:
+def build_app(dataplane: DataPlane, metrics: Metrics, settings: Settings, intake: Intake) -> FastAPI:
     """Build the application: the contract's routes, probes, metrics and documentation.
 
     Args:
         dataplane: executes the calls.
         metrics: counts the calls, and is served at ``/metrics``.
         settings: limits and tokens.
+        intake: bounds the calls and their bodies.
     """
     document = openapi_document(settings)
     # Serve Swagger UI from local files: vehicle networks often cannot reach a CDN.
@@ -49,7 +54,7 @@ def build_app(dataplane: DataPlane, metrics: Metrics, settings: Settings) -> Fas
     )
     app.openapi = lambda: document  # type: ignore[method-assign]  # as the FastAPI documentation does
     app.add_middleware(ExitStackMiddleware)
-    for route, endpoint in Endpoints(dataplane, metrics, settings).by_route().items():
+    for route, endpoint in Endpoints(dataplane, metrics, settings, intake).by_route().items():
         app.add_route(route.path, endpoint, methods=[route.verb])
 
     async def livez(_: Request) -> Response:
@@ -74,8 +79,10 @@ def build_app(dataplane: DataPlane, metrics: Metrics, settings: Settings) -> Fas
 class HttpServer:
     """uvicorn on a socket that this class opens; stopped by ``stop``, not by signals."""
 
-    def __init__(self, app: FastAPI, address: str) -> None:
-        self._configured_address = address
+    def __init__(self, app: FastAPI, settings: Settings) -> None:
+        self._configured_address = settings.http
+        limits = Connections(_max_connections(settings), settings.header_timeout, settings.body_timeout)
+        protocol: Any = functools.partial(BoundedProtocol, limits)
         self._server = _Uvicorn(
             uvicorn.Config(
                 app,
@@ -83,6 +90,7 @@ class HttpServer:
                 access_log=False,
                 lifespan="off",
                 ws="none",
+                http=protocol,
                 server_header=False,
             )
         )
@@ -147,6 +155,14 @@ async def _on_http_error(request: Request, exception: Any) -> Response:
 
 async def _on_error(request: Request, exception: Exception) -> Response:
     return problem_response(to_service_error(exception, request.url.path))
+
+
+def _max_connections(settings: Settings) -> int:
+    """Return the max number of connections: room for calls that are refused and for probes, beside all calls
+    in progress, as far as the process may open files."""
+    files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = 2 * (settings.max_concurrent_calls + settings.max_watchers)
+    return wanted if files == resource.RLIM_INFINITY else min(wanted, max(files // 2, 1))
 
 
 def _listen(address: str) -> socket.socket:

@@ -103,6 +103,14 @@ def test_faults(change: Callable[[pb.PredictRequest], None], field: str, detail:
     assert (fault.field, fault.detail) == (field, detail)
 
 
+def test_samples_are_bounded_by_the_bytes_of_the_response() -> None:
+    request = make_request(2, samples=6, horizon=3.0)
+    size = 6 * 2 * 6 * 2 * 8
+    assert read_options(request, INFO, Settings(max_response_bytes=size)).samples == 6
+    with pytest.raises(BadField, match=r"options\.samples: 6 × 2 .* × 6 steps are 1152 bytes; at most 1151"):
+        read_options(request, INFO, Settings(max_response_bytes=size - 1))
+
+
 def test_a_model_without_blind_forecasts_refuses_them() -> None:
     request = make_request(1, context=pb.CONTEXT_BLIND)
     with pytest.raises(BadField, match=r"options\.context: fake has no blind forecast"):

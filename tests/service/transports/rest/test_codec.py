@@ -2,6 +2,7 @@
 
 import math
 from contextlib import suppress
+from types import SimpleNamespace
 from typing import Any
 
 import hypothesis.strategies as st
@@ -82,6 +83,29 @@ def test_written_as_protobuf_writes_it(message: Message) -> None:
 def test_what_is_written_can_be_read(message: Message) -> None:
     again = parse_json(type(message), to_json(message))
     assert reference(again) == reference(message)  # not the messages: NaN is not equal to itself
+
+
+@given(any_message)
+def test_pieces_are_the_whole(message: Message) -> None:
+    assert to_json(message) == orjson.dumps(to_dict(message))
+
+
+def test_agents_are_serialized_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    response = pb.PredictResponse()
+    for index in range(20):
+        response.forecasts.add(agent_id=f"a{index}", samples=[1.5] * 1000)
+    sizes = []
+
+    def dumps(value: object, **options: Any) -> bytes:
+        text = orjson.dumps(value, **options)
+        sizes.append(len(text))
+        return text
+
+    monkeypatch.setattr(
+        "service.transports.rest.codec.orjson", SimpleNamespace(dumps=dumps, OPT_NON_STR_KEYS=4)
+    )
+    assert len(to_json(response)) > 20 * 4000
+    assert max(sizes) < 2 * 4000
 
 
 def test_both_spellings_are_read() -> None:

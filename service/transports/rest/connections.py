@@ -1,0 +1,124 @@
+"""HTTP connections within bounds of number, time and size of headers.
+
+uvicorn bounds none of these: without bounds, connections that never finish their headers would stay, and
+grow, for as long as their clients want.
+"""
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+
+MAX_HEADER_BYTES = 64 * 2**10
+"""Max size of the headers of a request."""
+_LINGER = 1.0
+"""Seconds after the body timeout in which the call itself can answer."""
+
+
+@dataclass
+class Connections:
+    """Limits of the connections of one server."""
+
+    max_connections: int
+    header_timeout: float
+    """Seconds from the connection, or the first byte of a later request, to the end of its headers."""
+    body_timeout: float
+    """Seconds from the end of the headers to the end of the body."""
+    waiting: "dict[BoundedProtocol, None]" = field(default_factory=dict)
+    """Connections without a request in progress, longest waiting first."""
+
+
+class BoundedProtocol(HttpToolsProtocol):
+    """HTTP/1.1 connection with timeouts while it receives, and a limit of its headers.
+
+    Beyond ``max_connections`` a new connection takes the place of the one that has been waiting longest for
+    the headers of a request. So connections that send none, or half of them, do not keep others out.
+    """
+
+    def __init__(self, limits: Connections, **arguments: Any) -> None:
+        super().__init__(**arguments)
+        self._limits = limits
+        self._header_bytes = 0
+        self._in_headers = True
+        self._timer: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Count the connection, and wait for its headers."""
+        super().connection_made(transport)
+        self._limits.waiting[self] = None
+        self._set_timer(self._limits.header_timeout, self._on_header_timeout)
+        if len(self.connections) > self._limits.max_connections:
+            oldest = next(iter(self._limits.waiting))
+            del self._limits.waiting[oldest]
+            oldest.transport.abort()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Stop waiting."""
+        self._limits.waiting.pop(self, None)
+        self._set_timer(None)
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """Parse data; refuse headers that are too large."""
+        super().data_received(data)
+        if self._in_headers and not self.transport.is_closing():
+            self._header_bytes += len(data)
+            if self._header_bytes > MAX_HEADER_BYTES:
+                self._refuse(b"431 Request Header Fields Too Large")
+
+    def on_message_begin(self) -> None:
+        """Wait for the headers of a request."""
+        super().on_message_begin()
+        self._in_headers = True
+        self._header_bytes = 0
+        self._set_timer(self._limits.header_timeout, self._on_header_timeout)
+
+    def on_headers_complete(self) -> None:
+        """Start the call, and wait for its body."""
+        self._in_headers = False
+        self._limits.waiting.pop(self, None)
+        self._set_timer(self._limits.body_timeout + _LINGER, self._on_body_timeout)
+        super().on_headers_complete()
+
+    def on_message_complete(self) -> None:
+        """Stop waiting: the request has arrived."""
+        self._set_timer(None)
+        super().on_message_complete()
+        self._wait_for_request()
+
+    def on_response_complete(self) -> None:
+        """Wait for the next request."""
+        super().on_response_complete()
+        self._wait_for_request()
+
+    def _wait_for_request(self) -> None:
+        """Let other connections take the place of this one if it is idle."""
+        idle = self._timer is None and self.cycle is not None and self.cycle.response_complete
+        if idle and not self.pipeline and self in self.connections:
+            self._limits.waiting[self] = None
+
+    def _on_header_timeout(self) -> None:
+        self._refuse(b"408 Request Timeout")
+
+    def _on_body_timeout(self) -> None:
+        if self.flow.read_paused:  # the server holds the body back, behind an earlier request
+            self._set_timer(self._limits.body_timeout, self._on_body_timeout)
+        else:
+            self.transport.close()
+
+    def _refuse(self, status: bytes) -> None:
+        """Close the connection, with a status unless a response is being sent on it."""
+        if self.cycle is None or self.cycle.response_complete:
+            self.transport.write(
+                b"HTTP/1.1 " + status + b"\r\nconnection: close\r\ncontent-length: 0\r\n\r\n"
+            )
+        self.transport.close()
+
+    def _set_timer(self, seconds: float | None, on_timeout: Callable[[], None] | None = None) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        if seconds is not None and on_timeout is not None:
+            self._timer = self.loop.call_later(seconds, on_timeout)
