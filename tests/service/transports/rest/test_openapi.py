@@ -132,7 +132,20 @@ def test_references_lead_somewhere() -> None:
 
 def test_errors_are_documented() -> None:
     responses = DOCUMENT["paths"]["/v1/predict"]["post"]["responses"]
-    assert sorted(responses) == ["200", "401", "404", "406", "413", "415", "422", "429", "500", "503", "504"]
+    assert sorted(responses) == [
+        "200",
+        "401",
+        "404",
+        "406",
+        "408",
+        "413",
+        "415",
+        "422",
+        "429",
+        "500",
+        "503",
+        "504",
+    ]
     assert "Retry-After" in responses["429"]["headers"]
     assert "application/problem+json" in responses["422"]["content"]
 
