@@ -1,8 +1,8 @@
-"""Angles and planar rotations."""
+"""Angles, planar rotations and nearest neighbours."""
 
 import numpy as np
 
-from model.arrays import Floats
+from model.arrays import Bools, Floats
 
 
 def wrap_angle(angle: Floats) -> Floats:
@@ -30,3 +30,20 @@ def rotation_matrices(angle: Floats) -> Floats:
     """Return matrices R for which R @ v is v rotated counter-clockwise by the angle: [..., 2, 2]."""
     cos, sin = np.cos(angle), np.sin(angle)
     return np.stack([np.stack([cos, -sin], axis=-1), np.stack([sin, cos], axis=-1)], axis=-2)
+
+
+def nearest_rows(rows: Floats, distance: Floats, seen: Bools, count: int) -> Floats:
+    """Return the rows of the nearest neighbours, nearest first, zeros behind the last one: [n, count, D].
+
+    Args:
+        rows: [n, m, D], numbers of each of m neighbours, as each of n agents sees it.
+        distance: [n, m], m.
+        seen: [n, m], whether the neighbour is taken at all.
+        count: maximum number of neighbours of an agent.
+    """
+    nearest = np.argsort(np.where(seen, distance, np.inf), axis=1, kind="stable")[:, :count]
+    picked = np.take_along_axis(rows, nearest[..., None], axis=1)
+    kept = np.take_along_axis(seen, nearest, axis=1)[..., None]
+    result = np.zeros((len(rows), count, rows.shape[-1]))
+    result[:, : nearest.shape[1]] = np.where(kept, picked, 0.0)
+    return result

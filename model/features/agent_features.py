@@ -4,12 +4,10 @@ import numpy as np
 import torch
 
 from model.arrays import Bools, Float32s, Floats, Ints
-from model.features.map_patches import map_patches
-from model.features.neighbors import nearest_rows
 from model.features.spec import FeatureSpec
 from model.forecaster import Context, Features
-from model.geometry import rotate, wrap_angle
-from model.scenes.raster import FAR, NEAR
+from model.geometry import nearest_rows, rotate, wrap_angle
+from model.scenes.raster import FAR, NEAR, map_patches
 from model.scenes.scene import AgentStates, AgentType, Scene
 
 HISTORY_SCALE = np.array([20.0, 5.0, 15.0, 5.0, 3.0, 3.0, 0.5, 0.5])

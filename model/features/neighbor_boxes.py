@@ -5,8 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from model.arrays import Float32s, Floats, Ints
-from model.features.neighbors import nearest_rows
-from model.geometry import rotate, wrap_angle
+from model.geometry import nearest_rows, rotate, wrap_angle
 from model.scenes.raster import COLUMNS_RIGHT, PATCH_PIXELS_PER_METER, PATCH_SIZE, ROWS_BEHIND
 from model.scenes.scene import AgentType, Scene
 

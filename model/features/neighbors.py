@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from model.arrays import Bools, Floats, Ints
+from model.arrays import Floats, Ints
 from model.features.standardization import ATTENTION_RADIUS, HEADING, STATE_SIZE, state_scale, state_vectors
 from model.geometry import wrap_angle
 from model.scenes.scene import AgentStates, AgentType
@@ -11,23 +11,6 @@ _RAMP = np.array([0.25, 0.5, 0.75, 1.0])
 """Weights of presence now, 0.5 s ago, … 1.5 s ago: an edge fades in (Trajectron++, section 4.1)."""
 _PRESENCE = {AgentType.VEHICLE: 1.0, AgentType.PEDESTRIAN: 2.0}
 """Weight of a neighbour's presence; the released code multiplies by the type's number."""
-
-
-def nearest_rows(rows: Floats, distance: Floats, seen: Bools, count: int) -> Floats:
-    """Return the rows of the nearest neighbours, nearest first, zeros behind the last one: [n, count, D].
-
-    Args:
-        rows: [n, m, D], numbers of each of m neighbours, as each of n agents sees it.
-        distance: [n, m], m.
-        seen: [n, m], whether the neighbour is taken at all.
-        count: maximum number of neighbours of an agent.
-    """
-    nearest = np.argsort(np.where(seen, distance, np.inf), axis=1, kind="stable")[:, :count]
-    picked = np.take_along_axis(rows, nearest[..., None], axis=1)
-    kept = np.take_along_axis(seen, nearest, axis=1)[..., None]
-    result = np.zeros((len(rows), count, rows.shape[-1]))
-    result[:, : nearest.shape[1]] = np.where(kept, picked, 0.0)
-    return result
 
 
 def edge_ramps(

@@ -5,14 +5,13 @@ import torch
 
 from model.arrays import Float32s, Floats, Ints
 from model.features.agent_features import agent_frame_features
-from model.features.map_patches import map_patches
 from model.features.neighbor_boxes import neighbor_boxes
 from model.features.neighbors import edge_ramps, neighbor_sums
 from model.features.spec import FeatureSpec, Frame
 from model.features.standardization import HEADING, state_scale, state_vectors
 from model.forecaster import Context, Features
 from model.geometry import wrap_angle
-from model.scenes.raster import NEAR
+from model.scenes.raster import NEAR, map_patches
 from model.scenes.scene import AgentStates, AgentType, Scene
 
 

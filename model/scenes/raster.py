@@ -7,6 +7,7 @@ columns to the left.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,8 +15,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from model.arrays import Bytes, Float32s, Floats
-from model.scenes.scene import Raster
+from model.arrays import Bytes, Float32s, Floats, Ints
+from model.scenes.scene import Raster, Scene
 
 PATCH_SIZE = 100
 """Rows and columns of a patch."""
@@ -49,6 +50,36 @@ NEAR = PatchGeometry(PATCH_SIZE, PATCH_PIXELS_PER_METER, ROWS_BEHIND, COLUMNS_RI
 FAR = PatchGeometry(PATCH_SIZE, 1.4, 14, 50)
 """61 m ahead, 10 m behind, 36 m to each side: no corner is farther than 74 m, where recorded rasters end
 (a patch that reached beyond that would reveal where no recorded agent goes)."""
+
+
+def map_patches(
+    scene: Scene,
+    targets: Ints,
+    given: Mapping[int, Bytes | Float32s],
+    geometry: PatchGeometry,
+    outside: float,
+) -> Float32s:
+    """Return the map patches of n agents: [n, 3, S, S] in [-1, 1].
+
+    Absent is −1, present 1; 0 is unknown. An agent's given patch takes precedence over the raster.
+
+    Args:
+        scene: the agents and their raster.
+        targets: [n], indices of agents.
+        given: agents' own patches by agent index, [3, S, S] in [0, 1].
+        geometry: where a patch's pixels lie.
+        outside: the value of pixels outside the raster, in [0, 1]: 0 absent, 0.5 unknown.
+    """
+    patches = np.zeros((len(targets), 3, geometry.size, geometry.size), dtype=np.float32)
+    own = np.array([int(target) in given for target in targets], dtype=np.bool_)
+    cut = ~own
+    if scene.raster is not None and cut.any():
+        states, seen = scene.states, targets[cut]
+        position, heading = states.position[seen, -1], states.heading[seen, -1]
+        patches[cut] = 2 * cut_patches(scene.raster, position, heading, geometry, outside) - 1
+    for row in np.flatnonzero(own):
+        patches[row] = 2 * given[int(targets[row])].astype(np.float32) - 1
+    return patches
 
 
 def cut_patches(

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from model.arrays import Ints
-from model.features.map_patches import map_patches
 from model.features.scene_features import network_features
 from model.features.spec import FeatureSpec, Frame
 from model.forecaster import Context
 from model.networks.config import CoverNetConfig, NetworkConfig
-from model.scenes.raster import NEAR
+from model.scenes.raster import NEAR, map_patches
 from model.scenes.scene import AgentType, Raster, Scene
 from tests.model.made_scenes import crowd
 
