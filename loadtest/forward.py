@@ -18,13 +18,13 @@ from model.features.spec import Frame
 from model.forecaster import Context, Features, ModelInfo, Protocol
 from model.networks.config import BlindContext, NetworkConfig
 from model.networks.forecaster import CvaeForecaster, CvaeNetworks
+from model.networks.graph import HISTORY_FRAMES
 from model.scenes.scene import AgentType
 
 AGENTS = (1, 8, 32, 128)
 FLOP_PER_AGENT = {Frame.GROUND: 42e6, Frame.AGENT: 25e6}
 """Multiplications and additions of the full forward pass, K = 25, T = 12: of the published network with its
 GRU unrolled (REFERENCE, section 2), and of the network in the agent's frame."""
-HISTORY_FRAMES = 5
 _SECONDS_EACH = 2.0
 _MIN_CALLS = 11
 _MATRIX = 1024

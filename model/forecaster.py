@@ -61,6 +61,11 @@ class ModelInfo(BaseModel):
         return f"{self.name}@{self.version}"
 
     @property
+    def contexts(self) -> tuple[Context, ...]:
+        """Contexts that the model can forecast in."""
+        return (Context.FULL, Context.BLIND) if self.supports_blind else (Context.FULL,)
+
+    @property
     def horizon(self) -> float:
         """Longest forecast, s."""
         return self.steps * STEP_SECONDS

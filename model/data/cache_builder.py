@@ -156,11 +156,11 @@ def _agent_frame_arrays(
     network = NetworkConfig(frame=Frame.AGENT, uses_map=False)
     recorded = SceneFrames(record, protocol, history_frames)
     sensed = SensedFrames(record, history_frames, seed=zlib.crc32(record.name.encode()))
-    frame = np.array([pair.frame for pair in record.pairs], dtype=np.int64)
-    track = np.array([pair.track for pair in record.pairs], dtype=np.int64)
+    identity = _identity(record, scene)
+    frame, track = identity["frame"], identity["track"]
     rows = 1 + variants
     parts: list[Arrays] = []
-    for now in np.unique(frame):  # the pairs are in this order
+    for now in np.unique(frame):  # ascending, as the pairs are
         reports = []
         for variant in range(rows):
             seen, tracks = sensed.at(int(now), variant) if variant else recorded.at(int(now))
@@ -182,13 +182,7 @@ def _agent_frame_arrays(
         [record.tracks[pair.track].positions(np.array(pair.frame)) for pair in record.pairs]
     )
     arrays["future"] = np.repeat(future + recorded_now[:, None], rows, axis=0) - arrays["position"][:, None]
-    of_pairs = {
-        "turn": turn,
-        "scene": np.full(len(frame), scene),
-        "track": track,
-        "frame": frame,
-        "token": np.array([pair.token.encode("ascii") for pair in record.pairs], dtype=np.bytes_),
-    }
+    of_pairs = identity | {"turn": turn}
     arrays |= {name: np.repeat(values, rows, axis=0) for name, values in of_pairs.items()}
     count = len(arrays["position"])
     return arrays | {"velocity": np.zeros((count, 2)), "edge_mask": np.zeros(count)}
@@ -204,10 +198,10 @@ def _pair_arrays(
 ) -> Arrays:
     """Return the rows of a scene's pairs in the ground frame, one a pair."""
     scenes = SceneFrames(record, protocol, history_frames)
-    frame = np.array([pair.frame for pair in record.pairs], dtype=np.int64)
-    track = np.array([pair.track for pair in record.pairs], dtype=np.int64)
+    identity = _identity(record, scene)
+    frame, track = identity["frame"], identity["track"]
     parts: list[Arrays] = []
-    for now in np.unique(frame):  # the pairs are in this order
+    for now in np.unique(frame):  # ascending, as the pairs are
         seen, tracks = scenes.at(int(now))
         targets = np.searchsorted(tracks, track[frame == now])
         features = network_features(seen, targets, AgentType.VEHICLE, config.features, Context.FULL)
@@ -218,12 +212,15 @@ def _pair_arrays(
         parts.append(part)
     future, turn = _paths(record, history_frames)
     arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    return arrays | {
-        "future": future,
-        "turn": turn,
-        "scene": np.full(len(frame), scene),
-        "track": track,
-        "frame": frame,
+    return arrays | identity | {"future": future, "turn": turn}
+
+
+def _identity(record: SceneRecord, scene: int) -> Arrays:
+    """Return what tells a scene's pairs apart: scene, track, frame and token, [P] each."""
+    return {
+        "scene": np.full(len(record.pairs), scene),
+        "track": np.array([pair.track for pair in record.pairs], dtype=np.int64),
+        "frame": np.array([pair.frame for pair in record.pairs], dtype=np.int64),
         "token": np.array([pair.token.encode("ascii") for pair in record.pairs], dtype=np.bytes_),
     }
 

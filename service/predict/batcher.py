@@ -22,13 +22,7 @@ from model.forecaster import Context, Features, Forecaster, agent_count, join
 from model.mixture import TrajectoryMixture
 from model.scenes.scene import AgentType
 from service.errors import DeadlineExceeded, Internal, Overloaded, Unavailable
-from service.predict.scheduler import (
-    MAX_BATCH_SECONDS,
-    MIN_BATCH_AGENTS,
-    CostModel,
-    DeadlineQueue,
-    Throughput,
-)
+from service.predict.scheduler import CostModel, DeadlineQueue, Throughput
 from service.predict.torch_threads import set_forward_threads
 from service.telemetry.metrics import Metrics
 
@@ -59,8 +53,6 @@ class Call:
         """Seconds of work for the call in helper threads."""
         self.places = 0
         """Number of queue places held."""
-        self.undecoded = 0
-        """Number of agents that have a place and are not in the queue yet."""
 
     def remaining(self) -> float:
         """Return the seconds until the deadline; negative after it."""
@@ -170,7 +162,6 @@ class Batcher:
         self._running: list[_Entry] = []
         self._running_since = 0.0
         self._waiting = 0
-        self._undecoded = 0
         self._wake = asyncio.Event()
         self._thread = ThreadPoolExecutor(
             1, thread_name_prefix="forward", initializer=set_forward_threads, initargs=(threads,)
@@ -258,14 +249,10 @@ class Batcher:
         self._require_room(agents)
         self._require_time(call.deadline, agents)
         call.places += agents
-        call.undecoded = agents
-        self._undecoded += agents
         self._count(agents)
         try:
             yield
         finally:
-            self._undecoded -= call.undecoded
-            call.undecoded = 0
             self._release(call, call.places)
 
     async def run(self, jobs: Sequence[Job], call: Call) -> list[Outcome]:
@@ -290,8 +277,6 @@ class Batcher:
         surplus = call.places - sum(entry.agents for entry in entries)
         if surplus > 0:  # agents that need no forward give their places back at once
             self._release(call, surplus)
-        self._undecoded -= call.undecoded
-        call.undecoded = 0
         for part in parts:
             lag = 0.0
             for entry in part:
@@ -319,8 +304,7 @@ class Batcher:
         """Return the job in parts that fit a batch."""
         queued = time.perf_counter()
         entries = []
-        within = self._costs.agents_within(job.key, MAX_BATCH_SECONDS)
-        size = min(self._max_batch, max(within, MIN_BATCH_AGENTS))
+        size = self._costs.batch_agents(job.key, self._max_batch)
         for start in range(0, job.agents, size):
             stop = min(start + size, job.agents)
             whole = stop - start == job.agents
@@ -452,7 +436,9 @@ class Batcher:
 
     def _expected_wait(self, deadline: float) -> float:
         """Return the expected seconds until the model is free for a new call of that deadline; 0 if it is."""
-        wait = self._queue.seconds_before(deadline) + self._costs.seconds_of_unknown(self._undecoded)
+        # The second forward of an agent is queued without a place
+        unplanned = max(self._waiting - self._queue.agents, 0)
+        wait = self._queue.seconds_before(deadline) + self._costs.seconds_of_unknown(unplanned)
         if self._running:
             running = sum(self._costs.seconds(entry.key, entry.agents) for entry in self._running)
             wait += max(running - self.forward_seconds, 1e-3)

@@ -69,13 +69,19 @@ class CostModel:
         """Return the expected seconds of a forward by a model that is not known yet."""
         return self.seconds(self._last_key, agents)
 
-    def agents_within(self, key: Hashable, seconds: float) -> int:
-        """Return how many agents a forward takes in so many seconds."""
+    def batch_agents(self, key: Hashable, max_agents: int) -> int:
+        """Return the max number of agents in a batch: so many as ``MAX_BATCH_SECONDS`` allows.
+
+        Args:
+            key: key of the batch's work.
+            max_agents: the max number in any case.
+        """
         known = self._rates.get(key) or self._rates.get(self._last_key) or {0: _FIRST_RATE}
         largest = max(known)
         # The agents that each rate allows, of a size that has it; larger batches have that of the largest
-        fitting = ((size, int(seconds * rate)) for size, rate in known.items())
-        return max(agents if size == largest else min(agents, 2**size - 1) for size, agents in fitting)
+        fitting = ((size, int(MAX_BATCH_SECONDS * rate)) for size, rate in known.items())
+        within = max(agents if size == largest else min(agents, 2**size - 1) for size, agents in fitting)
+        return min(max_agents, max(within, MIN_BATCH_AGENTS))
 
     def measure(self, key: Hashable, agents: int, seconds: float) -> None:
         """Learn from a forward."""
@@ -153,6 +159,11 @@ class DeadlineQueue(Generic[AnyWork]):
     def __iter__(self) -> Iterator[AnyWork]:
         return (entry for _, _, entry in self._entries)
 
+    @property
+    def agents(self) -> int:
+        """Number of queued agents."""
+        return self._agents.total()
+
     def put(self, entry: AnyWork, lag: float = 0.0) -> None:
         """Add an entry.
 
@@ -217,8 +228,7 @@ class DeadlineQueue(Generic[AnyWork]):
                 rest.append(item)
             else:
                 if not batch:
-                    within = self._costs.agents_within(entry.key, MAX_BATCH_SECONDS)
-                    limit = min(max_agents, max(within, MIN_BATCH_AGENTS))
+                    limit = self._costs.batch_agents(entry.key, max_agents)
                 batch.append(entry)
                 agents += entry.agents
         if not batch:

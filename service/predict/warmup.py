@@ -35,7 +35,7 @@ async def warm_up(batcher: Batcher, catalog: Catalog, max_batch_agents: int) -> 
         main = forecaster is catalog.default or forecaster is catalog.fallback
         sizes = _sizes(max_batch_agents) if main else [1]
         for kind in info.agent_types:
-            for context in (Context.FULL, Context.BLIND) if info.supports_blind else (Context.FULL,):
+            for context in info.contexts:
                 for job in await batcher.call_in_model_thread(_jobs, forecaster, kind, context, sizes):
                     await batcher.run_in_model_thread(job)
                     forwards += 1

@@ -56,7 +56,7 @@ class Intake:
         try:
             yield body
         finally:
-            body.shrink(0)
+            body.resize(0)
 
     def resize(self, old: int, new: int) -> None:
         """Change the reservation of one body.
@@ -93,11 +93,13 @@ class Body:
             Overloaded: the budget of bytes is used up.
         """
         if size > self._size:
-            self._intake.resize(self._size, size)
-            self._size = size
+            self.resize(size)
 
-    def shrink(self, size: int) -> None:
-        """Release what is reserved beyond that many bytes."""
-        if size < self._size:
-            self._intake.resize(self._size, size)
-            self._size = size
+    def resize(self, size: int) -> None:
+        """Reserve exactly that many bytes.
+
+        Raises:
+            Overloaded: the budget of bytes is used up.
+        """
+        self._intake.resize(self._size, size)
+        self._size = size

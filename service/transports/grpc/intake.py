@@ -116,8 +116,7 @@ class IntakeInterceptor(aio.ServerInterceptor):  # type: ignore[type-arg]  # gen
         if request is aio.EOF:  # type: ignore[attr-defined]  # the stubs lack it
             raise BadField("body", "is missing")
         if isinstance(request, bytes):  # the contract's methods, which parse their requests themselves
-            body.shrink(len(request))
-            body.grow(len(request))
+            body.resize(len(request))
         else:
-            body.shrink(0)
+            body.resize(0)
         return request

@@ -239,7 +239,7 @@ class _BodyWriter:
         self._send = send
         self._headers = headers
         self.started = False
-        """Whether the headers were sent."""
+        """True once the headers have been sent."""
 
     async def write(self, body: bytes, *, more: bool = True) -> None:
         """Send a piece, and the headers before the first one."""

@@ -145,8 +145,8 @@ def test_each_size_has_its_own_rate_and_others_that_of_the_nearest() -> None:
     assert model.seconds("model", 32) == pytest.approx(0.01)
     assert model.seconds("model", 40) == pytest.approx(0.0125)
     assert model.seconds("model", 320) == pytest.approx(0.1)
-    assert model.agents_within("model", 0.05) == 160
-    assert model.agents_within("new", 0.05) == 160
+    assert model.batch_agents("model", 1000) == 160
+    assert model.batch_agents("new", 1000) == 160
 
 
 def test_a_wrong_estimate_cannot_refuse_for_ever() -> None:
