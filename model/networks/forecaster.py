@@ -18,7 +18,7 @@ from model.networks.config import AnyNetworkConfig, CoverNetConfig, NetworkConfi
 from model.networks.covernet import CoverNet
 from model.networks.cvae import AgentNetwork
 from model.networks.dynamics import Positions
-from model.networks.graph import GraphForward
+from model.networks.graph import HISTORY_FRAMES, GraphForward
 from model.scenes.scene import AgentType, Scene
 
 MIN_VARIANCE = 1e-6
@@ -81,14 +81,18 @@ class NetworkForecaster(Forecaster, Generic[SomeNetworks]):
         self._graphs: dict[tuple[AgentType, Context], GraphForward] = {}
 
     def compile(self, threads: int | None = None) -> bool:
-        contexts = (Context.FULL, Context.BLIND) if self.info.supports_blind else (Context.FULL,)
-        for agent_type in self.info.agent_types:
-            for context in contexts:
-                try:
-                    graph = GraphForward(self.networks.of(agent_type), self.config, context, threads)
-                except LookupError:
-                    return False
-                self._graphs[agent_type, context] = graph
+        if self.info.history_frames != HISTORY_FRAMES:
+            return False
+        try:
+            self._graphs = {
+                (agent_type, context): GraphForward(
+                    self.networks.of(agent_type), self.config, context, threads
+                )
+                for agent_type in self.info.agent_types
+                for context in self.info.contexts
+            }
+        except LookupError:
+            return False
         return True
 
     def requires_heading(self, agent_type: AgentType) -> bool:

@@ -72,7 +72,7 @@ class GraphForward:
     """A network's forward in ONNX Runtime.
 
     Args:
-        network: the network, whose parameters it runs with; they are copied.
+        network: the network, whose parameters it runs with; the memory is shared.
         config: its architecture.
         context: full or blind.
         threads: threads of one forward; None: all cores.
@@ -95,7 +95,7 @@ class GraphForward:
         options.intra_op_num_threads = threads or 0
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         parameters = network.state_dict()
-        # The session reads the parameters where they are, so they must live as long as it does
+        # The session reads the parameters in place, so they must live as long as it does
         self._parameters = {
             name: onnxruntime.OrtValue.ortvalue_from_numpy(
                 parameters[name.removeprefix(PREFIX)].contiguous().numpy()

@@ -3,13 +3,13 @@
 import pytest
 import torch
 
-from loadtest.forward import features_in_agent_frame
+from loadtest.forward import cab_network, features_in_agent_frame
 from model.convert.onnx_graphs import architectures, export_graph
 from model.features.spec import Frame
 from model.forecaster import Context, Features
 from model.networks.agent_frame import AgentFrameNetwork
 from model.networks.config import BlindContext, NetworkConfig
-from model.networks.forecaster import CvaeNetworks
+from model.networks.forecaster import CvaeForecaster, CvaeNetworks
 from model.networks.graph import GRAPHS, PARAMETERS, GraphForward, graph_name
 from model.scenes.scene import AgentType
 
@@ -71,6 +71,18 @@ def test_fewer_steps_are_the_first_of_all() -> None:
 def test_architectures_without_a_graph_are_told(config: NetworkConfig) -> None:
     with pytest.raises(LookupError, match="graph"):
         GraphForward(CvaeNetworks(config).of(AgentType.VEHICLE), config, Context.FULL, 1)
+
+
+def test_a_model_of_another_history_stays_in_pytorch() -> None:
+    made = cab_network(Frame.AGENT)
+    assert made.compile(1)
+    state = made.networks.state_dict()
+    shorter = CvaeForecaster(made.info.model_copy(update={"history_frames": 3}), EVERYTHING, state)
+    assert not shorter.compile(1)
+    features = some_features(2)
+    features["history"] = features["history"][:, :3]
+    features["first"] = torch.zeros(2, dtype=torch.int64)
+    assert len(shorter.forecast(features, AgentType.VEHICLE)) == 2
 
 
 def test_every_architecture_that_is_exported_is_in_the_package() -> None:
