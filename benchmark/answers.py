@@ -45,8 +45,8 @@ class SceneAnswers:
     lost: int
     """Missing forecasts among those requested for dispersion and convergence only."""
     most_likely: Mapping[int, tuple[Ints, Floats]]
-    """By track: frames [F] of full history, ascending, and the most likely trajectories [F, T, 2] forecast
-    at these frames, m, ground frame."""
+    """Frames [F] of full history of each track, ascending, and the most likely trajectories [F, T, 2]
+    forecast at these frames, m, ground frame."""
     times: CallTimes
 
 

@@ -23,8 +23,8 @@ class Call:
     tracks: tuple[int, ...]
     """Indices of the agents' tracks in the scene, ascending."""
     due: frozenset[int]
-    """Those that are challenge pairs at this frame. The others are requested for dispersion and convergence,
-    which need an agent's most likely trajectory only."""
+    """Tracks that are challenge pairs at this frame. The others are requested for dispersion and
+    convergence, which need an agent's most likely trajectory only."""
 
 
 @dataclass(frozen=True)

@@ -94,7 +94,7 @@ class BenchmarkResults(Results):
 
     models: tuple[BenchmarkModelResult, ...]
     consistency: bool
-    """Whether forecasts for dispersion and convergence were requested."""
+    """True if forecasts for dispersion and convergence were requested."""
     seed: int
     plan: str
     """Digest of the requested forecasts and their data."""

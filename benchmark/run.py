@@ -91,7 +91,7 @@ class Benchmark:
     sampling: Sampling
     """Number of random draws."""
     consistency: bool = True
-    """Whether to request forecasts for dispersion and convergence, too."""
+    """Switch for requesting forecasts for dispersion and convergence, too."""
     limit: int | None = None
     """Number of pairs, from the first; None: all."""
 

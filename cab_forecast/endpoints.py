@@ -18,7 +18,7 @@ class Endpoint:
     """URL for people, e.g. ``grpc://127.0.0.1:50051``; without credentials."""
     transport: Literal["grpc", "rest"]
     secure: bool
-    """Whether the connection uses TLS."""
+    """True if the connection uses TLS."""
     target: str
     """``host:port`` for gRPC; the base URL, without a trailing slash, for REST."""
 

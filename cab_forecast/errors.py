@@ -33,7 +33,7 @@ class ForecastError(Exception):
 
     default_code: ClassVar[str] = "UNKNOWN"
     retryable: ClassVar[bool] = False
-    """Whether the same request may succeed shortly afterwards."""
+    """True if the same request may succeed shortly afterwards."""
 
     def __init__(
         self,

@@ -50,7 +50,7 @@ class Forecast:
     detail: str
     """Reason for a status other than OK."""
     field: str
-    """With INVALID: the invalid field."""
+    """Invalid field, with INVALID."""
     model: ModelReference
     """The model that made the forecast; with FALLBACK not the requested one."""
     history_frames: int

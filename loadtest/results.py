@@ -92,7 +92,7 @@ class Result:
     notes: list[str] = field(default_factory=list)
     """Further figures."""
     problems: list[str] = field(default_factory=list)
-    """What else must not happen but did."""
+    """Other events that must not happen but did."""
 
     @property
     def deadline(self) -> float | None:

@@ -54,7 +54,7 @@ class Options:
     encoding: Encoding = Encoding.PROTOBUF
     """Encoding of the bodies; gRPC has protobuf only."""
     poisson: bool = True
-    """Whether calls arrive at random times; False: at even intervals."""
+    """Switch for calls at random times; False: at even intervals."""
     grpc: str | None = None
     """HOST:PORT of a running server's gRPC; None: a server is started."""
     http: str | None = None

@@ -20,9 +20,10 @@ _LATERAL: Final = (1, 3, 5, HEADING, HEADING + 1)
 """Columns of a state that change sign in a mirror: y, its velocity and acceleration; of a vehicle also
 heading and heading rate."""
 _BOX_LATERAL: Final = (1, 2)
-"""Those of a box: distance to the left of the agent, heading."""
+"""Such columns of a box: distance to the left of the agent, heading."""
 _NEIGHBOR_LATERAL: Final = (1, 3, 5, 7)
-"""Those of a neighbour in the agent's frame: y, sine of the heading, velocity and acceleration along y."""
+"""Such columns of a neighbour in the agent's frame: y, sine of the heading, velocity and acceleration along
+y."""
 _MAPS: Final = ("map", "far_map")
 
 

@@ -152,7 +152,7 @@ class CrossSection:
     """Cross section of a road, along the distance d from its line."""
 
     lanes: Sequence[Lane]
-    """Those ahead and then those back, each from the middle to the edge."""
+    """Lanes ahead, then lanes back, each from the middle to the edge."""
     lane_width: float
     """m."""
     edges: tuple[float, float]
@@ -226,7 +226,7 @@ class Junction:
     """Roads that leave the origin, and what lies between their mouths."""
 
     arms: Sequence[Road]
-    """In the order of their directions, counter-clockwise; each begins at its mouth."""
+    """Roads in the order of their directions, counter-clockwise; each begins at its mouth."""
     ring: float
     """m, radius of a roundabout's lane; 0: a crossing."""
 

@@ -17,9 +17,9 @@ class Published:
     """A row of table 1: displacement errors and the driveable area."""
 
     ade_ml_m: Horizons
-    """At 1 … 6 s."""
+    """Errors at 1 … 6 s."""
     fde_ml_m: Horizons
-    """At 1 … 6 s."""
+    """Errors at 1 … 6 s."""
     off_road_ml: float
     sampled: tuple[float, float, float] | None = None
     """ADE-f and FDE-f at 6 s, m, and OffR-f, of 2000 samples; None: not tabulated."""
@@ -59,7 +59,7 @@ class PublishedHardCases:
     """A row of table 3: the pairs with the largest errors of the Kalman filter."""
 
     fde_6s_m: tuple[float, float, float, float]
-    """On the hardest 1, 2 and 3 % of the pairs, and on all."""
+    """Errors on the hardest 1, 2 and 3 % of the pairs, and on all."""
 
     def figures(self) -> dict[str, float]:
         """Return the figures by the names of ``benchmark.hard_cases.hardest_fde``."""

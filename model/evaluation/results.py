@@ -95,7 +95,7 @@ class EvaluationResults(Results):
 
     models: tuple[EvaluationModelResult, ...]
     ablate: bool
-    """Whether models were also evaluated with less context."""
+    """True if models were also evaluated with less context."""
 
     def statement(self) -> str:
         """Return what the figures are computed on, in words; every table carries it."""

@@ -35,7 +35,7 @@ class Evaluation:
     limit: int | None = None
     """Number of pairs, from the first; None: all."""
     ablate: bool = False
-    """Whether to evaluate checkpoints with less context, too."""
+    """Switch for evaluating checkpoints with less context, too."""
 
     def __call__(self, tick: Callable[[str, int], None], log: Callable[[str], None]) -> EvaluationResults:
         """Evaluate all models.

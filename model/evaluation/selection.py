@@ -35,7 +35,7 @@ class Selection:
 
     baselines: tuple[Forecaster, ...]
     oracle: bool
-    """Whether the physics oracle is among them."""
+    """True if the physics oracle is among them."""
     learned: tuple[Learned, ...]
 
     @property

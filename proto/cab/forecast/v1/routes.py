@@ -57,7 +57,7 @@ class Route(Generic[Request, Response]):
     request: type[Request]
     response: type[Response]
     streaming: bool = False
-    """Whether the response is a stream of messages (over REST: Server-Sent Events)."""
+    """True if the response is a stream of messages (over REST: Server-Sent Events)."""
 
     @property
     def rpc(self) -> str:
