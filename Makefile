@@ -13,7 +13,7 @@ PROTOS := $(wildcard proto/cab/forecast/v1/*.proto)
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) -c constraints.txt -e ".[dev]"
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) -c constraints.txt -e ".[dev,graphs]"
 	touch $@
 
 install: $(VENV)/.installed  ## create .venv with the package and the dev extra
@@ -22,7 +22,7 @@ run: install  ## serve on 127.0.0.1:8080 (REST) and 127.0.0.1:50051 (gRPC), and 
 	$(BIN)/cab-forecast serve --demo
 
 test: install lint proto-check  ## lint, check types and generated code, run all tests
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist loadfile
 
 # nuscenes-devkit needs numpy < 2, so it has its own environment, with all other pins of constraints.txt.
 $(NUSCENES)/.installed: pyproject.toml constraints.txt
