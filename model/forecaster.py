@@ -1,19 +1,49 @@
 """The interface of all forecasting models."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TypeAlias
 
+import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict
 
 from model.arrays import Ints
 from model.mixture import TrajectoryMixture
+from model.scenes.raster import MapView, cut_views
 from model.scenes.scene import STEP_SECONDS, AgentType, Scene
 
 Features: TypeAlias = dict[str, torch.Tensor]
 """Inputs of a forward pass by name; the first axis of every tensor is the agents'."""
+
+
+_CHUNK_AGENTS = 32
+"""Agents whose map patches a thread cuts at once."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Agents that wait for a forward: features, and views of the map in place of patches.
+
+    Patches are a hundred times as large as all else, so they are cut when the forward starts (``complete``).
+    """
+
+    features: Features
+    views: Mapping[str, MapView] = field(default_factory=dict)
+    """Views by the name of the feature that their patches become."""
+
+    def __len__(self) -> int:
+        return agent_count(self.features)
+
+    def __getitem__(self, agents: slice) -> "Prepared":
+        """Return successive agents."""
+        return Prepared(
+            {name: tensor[agents] for name, tensor in self.features.items()},
+            {name: view[agents] for name, view in self.views.items()},
+        )
 
 
 class Context(StrEnum):
@@ -74,9 +104,9 @@ class ModelInfo(BaseModel):
 class Forecaster(ABC):
     """A model that forecasts agents of a scene as Gaussian mixtures over their future positions.
 
-    Forecasting has two halves, so that agents of many scenes can share one forward pass: ``prepare`` takes
-    one scene, ``forecast`` takes agents of one type from any number of scenes, joined by ``join``. Both are
-    thread-safe.
+    Forecasting has two halves, so that agents of many scenes can share one forward pass: ``view`` takes one
+    scene, ``forecast`` takes agents of one type from any number of scenes, joined by ``complete``. Both are
+    thread-safe. ``prepare`` is ``view`` and ``complete`` of one scene.
     """
 
     info: ModelInfo
@@ -90,6 +120,16 @@ class Forecaster(ABC):
             targets: [n], indices of agents, all of one type in ``info.agent_types``, each observed now.
             context: full or blind.
         """
+
+    def view(self, scene: Scene, targets: Ints, context: Context = Context.FULL) -> Prepared:
+        """Return what ``prepare`` does, but with map patches that are not cut yet.
+
+        Args:
+            scene: as for ``prepare``.
+            targets: as for ``prepare``.
+            context: as for ``prepare``.
+        """
+        return Prepared(self.prepare(scene, targets, context))
 
     @abstractmethod
     def forecast(
@@ -143,6 +183,38 @@ def join(parts: Sequence[Features]) -> Features:
     if len(parts) == 1:
         return parts[0]
     return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+
+
+def complete(parts: Sequence[Prepared], threads: Executor | None = None) -> Features:
+    """Cut the map patches of agents, and concatenate all features, in order.
+
+    Args:
+        parts: agents with the same features.
+        threads: the threads to cut in; None: the calling one.
+    """
+    features = dict(join([part.features for part in parts]))
+    names = [name for name in parts[0].views for _ in parts]
+    views = [part.views[name] for name in parts[0].views for part in parts]
+    starts = _chunk_starts(names, [len(view) for view in views])
+    chunks = [views[start:stop] for start, stop in zip(starts, [*starts, len(views)][1:], strict=True)]
+    cut = [patch for some in (threads.map if threads else map)(cut_views, chunks) for patch in some]
+    for name in parts[0].views:
+        patches = [patch for one, patch in zip(names, cut, strict=True) if one == name]
+        # In numpy: torch would concatenate in threads of its own
+        features[name] = torch.from_numpy(patches[0] if len(parts) == 1 else np.concatenate(patches))
+    return features
+
+
+def _chunk_starts(names: Sequence[str], agents: Sequence[int]) -> list[int]:
+    """Return where the chunks of views begin that are cut at once: of one name, and of few agents."""
+    starts: list[int] = []
+    size = 0
+    for index, (name, count) in enumerate(zip(names, agents, strict=True)):
+        if not starts or name != names[starts[-1]] or size + count > _CHUNK_AGENTS:
+            starts.append(index)
+            size = 0
+        size += count
+    return starts
 
 
 def agent_count(features: Features) -> int:

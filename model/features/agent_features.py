@@ -5,9 +5,9 @@ import torch
 
 from model.arrays import Bools, Float32s, Floats, Ints
 from model.features.spec import FeatureSpec
-from model.forecaster import Context, Features
+from model.forecaster import Context, Features, Prepared, complete
 from model.geometry import nearest_rows, rotate, wrap_angle
-from model.scenes.raster import FAR, NEAR, map_patches
+from model.scenes.raster import FAR, NEAR, MapView, map_view
 from model.scenes.scene import AgentStates, AgentType, Scene
 
 HISTORY_SCALE = np.array([20.0, 5.0, 15.0, 5.0, 3.0, 3.0, 0.5, 0.5])
@@ -39,6 +39,11 @@ def agent_frame_features(scene: Scene, targets: Ints, spec: FeatureSpec, context
     Raises:
         ValueError: a target has no heading.
     """
+    return complete([agent_frame_view(scene, targets, spec, context)])
+
+
+def agent_frame_view(scene: Scene, targets: Ints, spec: FeatureSpec, context: Context) -> Prepared:
+    """Return ``agent_frame_features`` with map patches that are not cut yet."""
     states = scene.states
     heading = states.heading[targets, -1]
     if np.isnan(heading).any():
@@ -50,14 +55,16 @@ def agent_frame_features(scene: Scene, targets: Ints, spec: FeatureSpec, context
         "history": _histories(states, targets).astype(np.float32),
         "first": states.first[targets],
     }
+    views: dict[str, MapView] = {}
     if context is Context.FULL:
         if spec.neighbor_types:
             features["neighbors"] = _neighbors(scene, targets, spec.neighbor_types).astype(np.float32)
         if spec.uses_map:
-            features["map"] = map_patches(scene, targets, scene.patches, NEAR, outside=0.5)
+            views["map"] = map_view(scene, targets, scene.patches, NEAR, outside=0.5)
         if spec.far_map:
-            features["far_map"] = map_patches(scene, targets, scene.far_patches, FAR, outside=0.5)
-    return {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in features.items()}
+            views["far_map"] = map_view(scene, targets, scene.far_patches, FAR, outside=0.5)
+    tensors = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in features.items()}
+    return Prepared(tensors, views)
 
 
 def _histories(states: AgentStates, targets: Ints) -> Floats:

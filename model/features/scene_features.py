@@ -4,14 +4,14 @@ import numpy as np
 import torch
 
 from model.arrays import Float32s, Floats, Ints
-from model.features.agent_features import agent_frame_features
+from model.features.agent_features import agent_frame_view
 from model.features.neighbor_boxes import neighbor_boxes
 from model.features.neighbors import edge_ramps, neighbor_sums
 from model.features.spec import FeatureSpec, Frame
 from model.features.standardization import HEADING, state_scale, state_vectors
-from model.forecaster import Context, Features
+from model.forecaster import Context, Features, Prepared, complete
 from model.geometry import wrap_angle
-from model.scenes.raster import NEAR, map_patches
+from model.scenes.raster import NEAR, MapView, map_view
 from model.scenes.scene import AgentStates, AgentType, Scene
 
 
@@ -30,9 +30,16 @@ def network_features(
     Returns:
         Those of ``ground_frame_features`` or of ``model.features.agent_features.agent_frame_features``.
     """
+    return complete([network_view(scene, targets, agent_type, spec, context)])
+
+
+def network_view(
+    scene: Scene, targets: Ints, agent_type: AgentType, spec: FeatureSpec, context: Context
+) -> Prepared:
+    """Return ``network_features`` with map patches that are not cut yet."""
     if spec.frame is Frame.AGENT:
-        return agent_frame_features(scene, targets, spec, context)
-    return ground_frame_features(scene, targets, agent_type, spec, context)
+        return agent_frame_view(scene, targets, spec, context)
+    return _ground_frame_view(scene, targets, agent_type, spec, context)
 
 
 def ground_frame_features(
@@ -48,6 +55,12 @@ def ground_frame_features(
         [n, S, 5] (``model.features.neighbor_boxes``); ``map`` [n, 3, 100, 100] in [-1, 1], zeros where
         there is no map.
     """
+    return complete([_ground_frame_view(scene, targets, agent_type, spec, context)])
+
+
+def _ground_frame_view(
+    scene: Scene, targets: Ints, agent_type: AgentType, spec: FeatureSpec, context: Context
+) -> Prepared:
     states = scene.states
     features: dict[str, Floats | Float32s | Ints] = {
         "origin": states.position[targets, -1],
@@ -55,14 +68,16 @@ def ground_frame_features(
         "history": _own_history(states, targets, agent_type).astype(np.float32),
         "first": states.first[targets],
     }
+    views: dict[str, MapView] = {}
     if context is Context.FULL:
         if spec.neighbor_types and spec.neighbor_boxes:
             features["neighbor_boxes"] = neighbor_boxes(scene, targets, spec.neighbor_types)
         elif spec.neighbor_types:
             features |= _neighbor_histories(scene, targets, agent_type, spec.neighbor_types)
         if spec.looks_at_map(agent_type):
-            features["map"] = map_patches(scene, targets, scene.patches, NEAR, outside=0.0)
-    return {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in features.items()}
+            views["map"] = map_view(scene, targets, scene.patches, NEAR, outside=0.0)
+    tensors = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in features.items()}
+    return Prepared(tensors, views)
 
 
 def _own_history(states: AgentStates, targets: Ints, agent_type: AgentType) -> Floats:

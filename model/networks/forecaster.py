@@ -1,6 +1,7 @@
 """Forecasters around trained networks: CVAEs and CoverNet."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, Generic, TypeVar
 
@@ -9,9 +10,9 @@ import torch
 from torch import Tensor, nn
 
 from model.arrays import Ints
-from model.features.scene_features import network_features
+from model.features.scene_features import network_view
 from model.features.spec import Frame
-from model.forecaster import Context, Features, Forecaster, ModelInfo
+from model.forecaster import Context, Features, Forecaster, ModelInfo, Prepared, complete
 from model.mixture import TrajectoryMixture
 from model.networks.agent_frame import AgentFrameNetwork
 from model.networks.config import AnyNetworkConfig, CoverNetConfig, NetworkConfig
@@ -110,12 +111,15 @@ class NetworkForecaster(Forecaster, Generic[SomeNetworks]):
         )
 
     def prepare(self, scene: Scene, targets: Ints, context: Context = Context.FULL) -> Features:
+        return complete([self.view(scene, targets, context)])
+
+    def view(self, scene: Scene, targets: Ints, context: Context = Context.FULL) -> Prepared:
         agent_type = scene.types[int(targets[0])]
         states = scene.states.last_frames(self.info.history_frames)
         states.require_observed(targets)
         if self.requires_heading(agent_type) and np.isnan(states.heading[targets, -1]).any():
             raise ValueError("an agent to be forecast has no heading")
-        return network_features(replace(scene, states=states), targets, agent_type, self._spec, context)
+        return network_view(replace(scene, states=states), targets, agent_type, self._spec, context)
 
     @torch.inference_mode()
     def forecast(
@@ -125,8 +129,27 @@ class NetworkForecaster(Forecaster, Generic[SomeNetworks]):
         context: Context = Context.FULL,
         steps: int | None = None,
     ) -> TrajectoryMixture:
-        network = self._graphs.get((agent_type, context)) or self.networks.of(agent_type)
-        return network_mixture(network, features, context, steps or self.info.steps, MIN_VARIANCE)
+        steps = steps or self.info.steps
+        graph = self._graphs.get((agent_type, context))
+        if graph is None:
+            return network_mixture(self.networks.of(agent_type), features, context, steps, MIN_VARIANCE)
+        with one_torch_thread():
+            return network_mixture(graph, features, context, steps, MIN_VARIANCE)
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Let torch compute in the calling thread alone.
+
+    Its other threads spin for milliseconds after each parallel section, on cores that a graph's own threads
+    need: a forward of 32 agents takes twice the CPU time beside them.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def network_mixture(

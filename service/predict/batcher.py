@@ -8,9 +8,10 @@ event loop, so there are no locks.
 
 import asyncio
 import math
+import os
 import time
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass, field
 from typing import NoReturn, TypeVar
@@ -18,12 +19,12 @@ from typing import NoReturn, TypeVar
 import structlog
 import torch
 
-from model.forecaster import Context, Features, Forecaster, agent_count, join
+from model.forecaster import Context, Forecaster, Prepared, complete
 from model.mixture import TrajectoryMixture
 from model.scenes.scene import AgentType
 from service.errors import DeadlineExceeded, Internal, Overloaded, Unavailable
 from service.predict.scheduler import CostModel, DeadlineQueue, Throughput
-from service.predict.torch_threads import set_forward_threads
+from service.predict.torch_threads import set_forward_threads, set_helper_threads
 from service.telemetry.metrics import Metrics
 
 _log = structlog.get_logger(__name__)
@@ -32,6 +33,8 @@ _T = TypeVar("_T")
 
 _MIN_RETRY = 0.05
 _MAX_RETRY = 10.0
+_CUT_IN_THREADS = 8
+"""Agents of a batch from which on map patches are cut in several threads."""
 _USABLE = 0.8
 """Share of the time until the deadline that a call may be expected to take when it is admitted; estimates may
 be wrong by the rest."""
@@ -82,13 +85,13 @@ class Job:
     forecaster: Forecaster
     agent_type: AgentType
     context: Context
-    features: Features
+    inputs: Prepared
     steps: int
 
     @property
     def agents(self) -> int:
         """Number of agents."""
-        return agent_count(self.features)
+        return len(self.inputs)
 
     @property
     def key(self) -> tuple[int, AgentType, Context]:
@@ -115,7 +118,7 @@ class _Entry:
     """A job, or a part of one, that fits a batch."""
 
     job: Job
-    features: Features
+    inputs: Prepared
     agents: int
     call: Call
     queued: float
@@ -166,6 +169,9 @@ class Batcher:
         self._thread = ThreadPoolExecutor(
             1, thread_name_prefix="forward", initializer=set_forward_threads, initargs=(threads,)
         )
+        self._cutters = ThreadPoolExecutor(
+            threads or os.cpu_count(), thread_name_prefix="patches", initializer=set_helper_threads
+        )
         self._worker: asyncio.Task[None] | None = None
         self._crashed = False
         self._on_crash: Callable[[], None] | None = None
@@ -198,6 +204,7 @@ class Batcher:
         self._fail(self._queue, Unavailable("the server is stopping"))
         self._queue.clear()
         await asyncio.to_thread(self._thread.shutdown)
+        self._cutters.shutdown()
 
     def admit(self, deadline: float) -> Call:
         """Admit a call on its arrival, before any work is spent on it.
@@ -293,7 +300,7 @@ class Batcher:
 
     async def run_in_model_thread(self, job: Job) -> None:
         """Run a job past the queue, for warm-up, and learn how long it takes."""
-        _, seconds = await self.call_in_model_thread(_forward, job, [job.features], job.steps)
+        _, seconds = await self.call_in_model_thread(_forward, job, [job.inputs], job.steps, self._cutters)
         self._costs.measure(job.key, job.agents, seconds)
 
     async def call_in_model_thread(self, function: Callable[..., _T], *arguments: object) -> _T:
@@ -308,8 +315,8 @@ class Batcher:
         for start in range(0, job.agents, size):
             stop = min(start + size, job.agents)
             whole = stop - start == job.agents
-            features = job.features if whole else {name: t[start:stop] for name, t in job.features.items()}
-            entries.append(_Entry(job, features, stop - start, call, queued))
+            inputs = job.inputs if whole else job.inputs[start:stop]
+            entries.append(_Entry(job, inputs, stop - start, call, queued))
         return entries
 
     def _withdraw(self, entries: Sequence[_Entry]) -> None:
@@ -333,8 +340,10 @@ class Batcher:
     async def _run_batch(self, batch: Sequence[_Entry], started: float) -> None:
         job = batch[0].job
         steps = max(entry.job.steps for entry in batch)
-        parts = [entry.features for entry in batch]
-        running = asyncio.get_running_loop().run_in_executor(self._thread, _forward, job, parts, steps)
+        parts = [entry.inputs for entry in batch]
+        running = asyncio.get_running_loop().run_in_executor(
+            self._thread, _forward, job, parts, steps, self._cutters
+        )
         try:
             mixture, seconds = await asyncio.shield(running)
         except asyncio.CancelledError:  # the batcher stops; a batch that has started is finished first
@@ -459,8 +468,16 @@ class Batcher:
         self._count(-agents)
 
 
-def _forward(job: Job, parts: Sequence[Features], steps: int) -> tuple[TrajectoryMixture, float]:
+def _forward(
+    job: Job, parts: Sequence[Prepared], steps: int, cutters: Executor
+) -> tuple[TrajectoryMixture, float]:
     """Run one forward of the job's forecaster over the joined parts.
+
+    Args:
+        job: a job of the batch.
+        parts: the agents of the batch.
+        steps: number of steps.
+        cutters: threads that cut map patches.
 
     Returns:
         The mixture, and the seconds that it took.
@@ -470,10 +487,11 @@ def _forward(job: Job, parts: Sequence[Features], steps: int) -> tuple[Trajector
     """
     started = time.perf_counter()
     with torch.inference_mode():
-        features = join(parts)
+        agents = sum(map(len, parts))
+        features = complete(parts, cutters if agents >= _CUT_IN_THREADS else None)
         mixture = job.forecaster.forecast(features, job.agent_type, job.context, steps)
     info = job.forecaster.info
-    agents, modes = agent_count(features), info.modes
+    modes = info.modes
     expected = ((agents, modes), (agents, modes, steps, 2), (agents, modes, steps, 2, 2), (agents, 2))
     tensors = (mixture.log_weights, mixture.means, mixture.covariances, mixture.origin)
     shapes = tuple(tuple(tensor.shape) for tensor in tensors)

@@ -148,8 +148,8 @@ class Plan:
         seen = replace(scene, states=scene.states.last_frames(info.history_frames))
         targets = np.array([draft.row for draft in drafts], dtype=np.int64)
         with torch.inference_mode():
-            features = forecaster.prepare(seen, targets, context)
-        return Group(Job(forecaster, kind, context, features, self.options.steps), drafts)
+            inputs = forecaster.view(seen, targets, context)
+        return Group(Job(forecaster, kind, context, inputs, self.options.steps), drafts)
 
 
 def make_plan(

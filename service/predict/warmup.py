@@ -6,7 +6,7 @@ import numpy as np
 import structlog
 import torch
 
-from model.forecaster import Context, Features, Forecaster, agent_count, join
+from model.forecaster import Context, Features, Forecaster, Prepared, agent_count, join
 from model.scenes.scene import STEP_SECONDS, AgentStates, AgentType, Raster, Scene
 from service.predict.batcher import Batcher, Job
 from service.predict.catalog import Catalog
@@ -53,7 +53,7 @@ def _jobs(forecaster: Forecaster, kind: AgentType, context: Context, sizes: list
     with torch.inference_mode():
         few = forecaster.prepare(_scene(forecaster, kind), np.arange(_SCENE_AGENTS), context)
         steps = forecaster.info.steps
-        return [Job(forecaster, kind, context, _repeat(few, size), steps) for size in sizes]
+        return [Job(forecaster, kind, context, Prepared(_repeat(few, size)), steps) for size in sizes]
 
 
 def _repeat(features: Features, size: int) -> Features:

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -6,10 +7,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from model.arrays import Floats
+from model.arrays import Bytes, Float32s, Floats, Ints
 from model.geometry import rotate
-from model.scenes.raster import FAR, NEAR, PATCH_SIZE, PatchGeometry, cut_patches
-from model.scenes.scene import Raster
+from model.scenes.raster import (
+    FAR,
+    NEAR,
+    PATCH_SIZE,
+    MapView,
+    PatchGeometry,
+    cut_patches,
+    cut_views,
+    map_view,
+)
+from model.scenes.scene import Raster, Scene
+from tests.model.made_scenes import crowd
+
+VEHICLES = np.array([0, 1, 2])
 
 
 def _smooth(points: Floats) -> Floats:
@@ -243,3 +256,53 @@ def test_a_patch_does_not_hang_on_whose_else_are_cut(
         position = np.concatenate([middle[None], others[:count]])
         together = cut_patches(raster, position, heading[: 1 + count], geometry)
         np.testing.assert_allclose(together[0], alone, atol=2e-3)
+
+
+def _views(outside: float) -> list[MapView]:
+    """Views of one, two and no agents: on rasters of different sizes and resolutions, beside them, of given
+    patches, and without a raster."""
+    scene = crowd()
+    bare = Scene(scene.types, scene.states)
+    fine = Raster(_raster().layers, np.array([-40.0, -30.0]), 7.0)
+    beside = Raster(_raster().layers, np.array([500.0, 0.0]), 3.0)
+    given: dict[int, Bytes | Float32s] = {int(VEHICLES[0]): np.eye(100, dtype=np.uint8)[None].repeat(3, 0)}
+
+    def view(raster: Raster | None, targets: Ints, patches: dict[int, Bytes | Float32s]) -> MapView:
+        return map_view(replace(bare, raster=raster), targets, patches, FAR, outside)
+
+    one, two = VEHICLES[:1], VEHICLES[:2]
+    small = Raster(np.ones((3, 4, 9), dtype=np.uint8), np.zeros(2), 0.5)
+    wholes = [
+        view(raster, targets, {}) for raster in (_raster(), fine, small, beside) for targets in (one, two)
+    ]
+    return [
+        *wholes,
+        view(None, one, {}),
+        view(fine, two, given),
+        view(fine, one, given),
+        view(fine, one[:0], {}),
+    ]
+
+
+@pytest.mark.parametrize("outside", [0.0, 0.5])
+def test_views_cut_together_have_the_patches_of_each(outside: float) -> None:
+    views = _views(outside)
+    for together, view in zip(cut_views(views), views, strict=True):
+        assert together.shape == (len(view), 3, FAR.size, FAR.size)
+        np.testing.assert_allclose(together, view.cut(), atol=2e-3)
+
+
+def test_a_part_of_a_view_has_the_patches_of_its_agents() -> None:
+    view = _views(0.5)[-3]
+    assert view.given
+    whole = view.cut()
+    np.testing.assert_allclose(np.concatenate([view[:1].cut(), view[1:].cut()]), whole, atol=1e-5)
+    assert (view[:1].cut() != view[1:].cut()).any()
+
+
+def test_a_view_takes_a_small_part_of_the_memory_of_its_patches() -> None:
+    raster = Raster(np.ones((3, 400, 400), dtype=np.uint8), np.array([-200.0, -200.0]), 1.0)
+    view = map_view(replace(crowd(), raster=raster), VEHICLES, {}, NEAR, 0.5)
+    assert view.layers is not None
+    assert np.shares_memory(view.layers, raster.layers)
+    assert 50 * (view.center.nbytes + view.heading.nbytes) < view.cut().nbytes

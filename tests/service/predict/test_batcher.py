@@ -9,7 +9,7 @@ import pytest
 import torch
 from structlog.testing import capture_logs
 
-from model.forecaster import Context, Features
+from model.forecaster import Context, Features, Prepared
 from model.mixture import TrajectoryMixture
 from model.scenes.scene import AgentType
 from service.errors import DeadlineExceeded, Internal, Overloaded, Unavailable
@@ -52,7 +52,7 @@ def job(
     steps: int = 12,
     x: float = 0.0,
 ) -> Job:
-    return Job(fake, kind, context, features(agents, x), steps)
+    return Job(fake, kind, context, Prepared(features(agents, x)), steps)
 
 
 def submit(batcher: Batcher, *jobs: Job, deadline: float = FAR) -> "asyncio.Task[list[Outcome]]":

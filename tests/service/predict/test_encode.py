@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
-from model.forecaster import Context
+from model.forecaster import Context, Prepared
 from model.mixture import TrajectoryMixture
 from model.scenes.scene import AgentType, Raster
 from service.errors import Fault
@@ -32,7 +32,7 @@ def result(ends: list[float], heaviest: int = 0) -> Group:
     origin = torch.tensor([1000.0, 2000.0], dtype=torch.float64).expand(len(ends), 2)
     covariances = torch.eye(2).expand(len(ends), 3, 12, 2, 2)
     outcome = Outcome(TrajectoryMixture(weights.log(), means, covariances, origin), 0.0, 0.0, len(ends))
-    return Group(Job(forecaster, AgentType.VEHICLE, Context.FULL, {}, 12), drafts, outcome)
+    return Group(Job(forecaster, AgentType.VEHICLE, Context.FULL, Prepared({}), 12), drafts, outcome)
 
 
 def raster() -> Raster:

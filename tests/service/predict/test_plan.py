@@ -29,7 +29,7 @@ def plan_of(request: pb.PredictRequest, fake: FakeForecaster) -> Plan:
 def outcome(group: Group, broken: tuple[int, ...] = ()) -> Outcome:
     """Return the outcome of a group, in which the forecasts of some rows are NaN."""
     job = group.job
-    mixture = job.forecaster.forecast(job.features, job.agent_type, job.context, job.steps)
+    mixture = job.forecaster.forecast(job.inputs.features, job.agent_type, job.context, job.steps)
     mixture.means[list(broken)] = torch.nan
     return Outcome(mixture, 0.1, 0.2, len(mixture))
 
@@ -64,7 +64,7 @@ def test_rows_are_those_of_the_usable_agents() -> None:
         ("a3", 3, 2),
     ]
     assert plan.drafts[0].forecaster is None
-    assert plan.groups[0].job.features["position"][:, 1].tolist() == [4.0, 12.0]
+    assert plan.groups[0].job.inputs.features["position"][:, 1].tolist() == [4.0, 12.0]
 
 
 def test_steps_and_context_reach_the_jobs() -> None:
