@@ -24,7 +24,7 @@ if TYPE_CHECKING:
         Unavailable,
         UnknownTrack,
     )
-    from cab_forecast.forecast import Forecast, Status, Tracking, forecasts, tracking
+    from cab_forecast.forecast import Forecast, InputWarning, Status, Tracking, forecasts, tracking
     from cab_forecast.requests import agent, map_patch, predict_request, scene_raster
     from cab_forecast.streams import AsyncStream, Stream
 
@@ -37,6 +37,7 @@ __all__ = [
     "FieldViolation",
     "Forecast",
     "ForecastError",
+    "InputWarning",
     "InternalError",
     "NotFound",
     "Overloaded",
@@ -63,6 +64,7 @@ _MODULES = {
     "Client": "client",
     "demo_request": "demo",
     "Forecast": "forecast",
+    "InputWarning": "forecast",
     "Status": "forecast",
     "Stream": "streams",
     "Tracking": "forecast",

@@ -9,7 +9,12 @@ import numpy.typing as npt
 
 from cab.forecast.v1.consistency_service_pb2 import InstantConsistency, TrackingStatus
 from cab.forecast.v1.model_service_pb2 import AgentType, InputProtocol, ModelReference
-from cab.forecast.v1.prediction_service_pb2 import AgentForecast, ForecastStatus, PredictResponse
+from cab.forecast.v1.prediction_service_pb2 import (
+    AgentForecast,
+    ForecastStatus,
+    InputWarningCode,
+    PredictResponse,
+)
 
 _Floats = npt.NDArray[np.float64]
 
@@ -36,6 +41,18 @@ class Tracking(StrEnum):
     """The track was inconsistent with the request, or lost, and starts anew."""
     UNAVAILABLE = "UNAVAILABLE"
     """The track memory did not respond in time."""
+
+
+@dataclass(frozen=True)
+class InputWarning:
+    """A contradiction in an agent's input."""
+
+    code: str
+    """Kind of contradiction, e.g. ``VELOCITY_MISMATCH``; ``UNSPECIFIED``: this client does not know it."""
+    detail: str
+    """What contradicts what."""
+    field: str
+    """Path of the field in the request."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +92,8 @@ class Forecast:
     """Status of this agent's track."""
     consistency: InstantConsistency | None
     """Consistency of the forecasts of the agent's newest observation; None: not requested or not known."""
+    warnings: tuple[InputWarning, ...]
+    """Contradictions in the agent's input, whatever the status."""
 
     @property
     def most_likely(self) -> _Floats:
@@ -97,7 +116,7 @@ class Forecast:
 def forecasts(response: PredictResponse) -> dict[str, Forecast]:
     """Return the forecasts of a response by agent id, in the request's order.
 
-    If the request holds an id twice, the server reports the second agent as INVALID; the first one is kept.
+    If the request holds an id twice, the server reports both agents as INVALID; the first one is returned.
 
     Raises:
         ValueError: sizes in the response contradict each other.
@@ -156,6 +175,9 @@ def _forecast(entry: AgentForecast, response: PredictResponse) -> Forecast:
         samples=_shaped(entry, "samples", entry.samples, (samples, steps, 2)),
         tracking=tracking(entry),
         consistency=entry.consistency if entry.HasField("consistency") else None,
+        warnings=tuple(
+            InputWarning(_warning_code(one.code), one.detail, one.field) for one in entry.warnings
+        ),
     )
 
 
@@ -170,6 +192,10 @@ def _status(number: int) -> Status:
     # A newer server may have more of them.
     name = ForecastStatus.Name(number) if number in ForecastStatus.values() else ""  # type: ignore[arg-type]
     return Status.__members__.get(name.removeprefix("FORECAST_STATUS_"), Status.UNSPECIFIED)
+
+
+def _warning_code(number: int) -> str:
+    return _name(InputWarningCode.items(), "INPUT_WARNING_CODE_", number).upper()
 
 
 def _name(items: Iterable[tuple[str, int]], prefix: str, number: int) -> str:

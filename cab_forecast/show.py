@@ -71,7 +71,7 @@ def print_forecasts(
         if view.status is not Status.OK:
             console.print(_note(view, response), highlight=False, soft_wrap=True)
     console.print(f"[dim]{escape(_origin(response))}[/]", highlight=False, soft_wrap=True)
-    for warning in (*response.warnings, *_memory_warnings(response, views)):
+    for warning in (*response.warnings, *_input_warnings(views), *_memory_warnings(response, views)):
         console.print(f"[yellow]warning: {escape(warning)}[/]", highlight=False, soft_wrap=True)
 
 
@@ -162,6 +162,16 @@ def _wide(console: Console | None) -> Console:
     if console.is_terminal:
         return console
     return Console(file=console.file, width=_UNBOUNDED)  # files and pipes have no width
+
+
+def _input_warnings(views: Sequence[Forecast]) -> Iterator[str]:
+    """Yield the warnings of agents' inputs; one that several agents have in the same words only once."""
+    agents: dict[tuple[str, str], list[str]] = {}
+    for view in views:
+        for warning in view.warnings:
+            agents.setdefault((warning.code, warning.detail), []).append(view.agent_id)
+    for (code, detail), names in agents.items():
+        yield f"{code}: {', '.join(names)}: {detail}"
 
 
 def _memory_warnings(response: PredictResponse, views: Sequence[Forecast]) -> Iterator[str]:

@@ -139,8 +139,8 @@ class SensedFrames:
         kept &= random.random(count) >= draw.lost_share
         kept[-1] = True
         ages = np.unique(ages[kept])[::-1]
-        position, velocity = _spline(one.position[past], ages)
-        heading = _headings(one.heading[past], ages)
+        position, velocity = spline(one.position[past], ages)
+        heading = interpolated_headings(one.heading[past], ages)
         size = len(ages)
         position = position + draw.position_noise_m * random.standard_normal((size, 2))
         heading = heading + draw.heading_noise_rad * random.standard_normal(size)
@@ -162,7 +162,7 @@ class _Report:
     velocity: Floats  # [S, 2]
 
 
-def _spline(positions: Floats, ages: Floats) -> tuple[Floats, Floats]:
+def spline(positions: Floats, ages: Floats) -> tuple[Floats, Floats]:
     """Return positions and velocities on the spline through poses 0.5 s apart; the last one is now.
 
     Args:
@@ -191,7 +191,7 @@ def _spline(positions: Floats, ages: Floats) -> tuple[Floats, Floats]:
     return position, slope / STEP_SECONDS
 
 
-def _headings(headings: Floats, ages: Floats) -> Floats:
+def interpolated_headings(headings: Floats, ages: Floats) -> Floats:
     """Return headings interpolated between poses 0.5 s apart, along the shorter arc: [S], rad."""
     turned = np.unwrap(headings)
     place = len(headings) - 1 - ages / STEP_SECONDS

@@ -42,6 +42,7 @@ def encode(plan: Plan, seed: int) -> pb.PredictResponse:
         forecast = response.forecasts.add(agent_id=draft.agent_id, status=draft.status, detail=draft.detail)
         if draft.status == pb.FORECAST_STATUS_INVALID:
             forecast.field = draft.field
+        forecast.warnings.extend(plan.input_warnings.get(draft.index, ()))
         if draft.forecaster is not None:
             forecast.model.CopyFrom(reference(draft.forecaster.info))
             forecast.history_frames = draft.history_frames

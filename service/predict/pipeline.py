@@ -18,10 +18,17 @@ from service.lifecycle import Lifecycle
 from service.predict.batcher import Batcher, Call
 from service.predict.catalog import Catalog
 from service.predict.encode import count_off_road, encode
+from service.predict.input_warnings import code_name, code_names
 from service.predict.plan import Plan, frames_of, make_plan, set_outcomes
 from service.predict.request import Agents, Options, read_agents, read_options
 from service.predict.request_reader import EncodedRequest, RequestReader
-from service.predict.track_updates import forecast_updates, observation_updates, report, with_histories
+from service.predict.track_updates import (
+    forecast_updates,
+    observation_updates,
+    report,
+    unambiguous,
+    with_histories,
+)
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
 from service.tracking.tracker import Tracker, TrackingResult
@@ -55,6 +62,7 @@ class Pipeline:
         self._tracker = tracker
         self._threads = threads
         self._reader = RequestReader(threads)
+        metrics.begin_input_warnings(code_names())
 
     @contextmanager
     def accept(self, timeout: float | None = None) -> Iterator[Call]:
@@ -117,6 +125,7 @@ class Pipeline:
                     response, stored = await asyncio.gather(encoding, self._remember(plan, recalled, call))
                     report(response, recalled, stored)
         self._count_agents(plan)
+        self._count_warnings(response)
         return response
 
     async def _recall(
@@ -128,7 +137,7 @@ class Pipeline:
         tracked = await self._tracker.exchange(
             options.scene_id,
             options.time,
-            own,
+            unambiguous(agents, own),
             call.remaining() - _RESERVE,
             history_s=history_seconds(frames_of(forecaster, self.catalog)),
             latest=options.consistency,
@@ -169,6 +178,11 @@ class Pipeline:
         for status, count in Counter(draft.status for draft in plan.drafts).items():
             text = pb.ForecastStatus.Name(status).removeprefix("FORECAST_STATUS_").lower()
             self._metrics.agents.labels(name, text).inc(count)
+
+    def _count_warnings(self, response: pb.PredictResponse) -> None:
+        for forecast in response.forecasts:
+            for warning in forecast.warnings:
+                self._metrics.input_warnings.labels(code_name(warning.code)).inc()
 
     async def _in_thread(self, call: Call, function: Callable[..., _T], *arguments: object) -> _T:
         """Run a function in a helper thread, and count its time as the call's."""

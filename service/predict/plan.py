@@ -15,6 +15,7 @@ from model.scenes.scene import AgentType, Raster, Scene
 from service.errors import BadFields, Fault
 from service.predict.batcher import Job, Outcome
 from service.predict.catalog import Catalog
+from service.predict.input_warnings import Warnings, input_warnings, of_context_agents
 from service.predict.request import Agents, Options, read_agents, read_raster
 from service.settings import FALLBACK_MODEL, Settings
 
@@ -91,6 +92,8 @@ class Plan:
     drafts: list[Draft]
     """One per forecast of the response, in its order."""
     warnings: list[str]
+    input_warnings: Warnings
+    """Contradictions in the input of agents."""
     groups: list[Group] = field(default_factory=list)
 
     def add_groups(self, drafts: Iterable[Draft]) -> list[Group]:
@@ -186,9 +189,11 @@ def make_plan(
             drafts.append(draft)
         elif agents.predict[index] and scene is not None:
             drafts.append(_assign(index, agent_id, scene, rows[index], (forecaster, catalog.fallback)))
-    plan = Plan(options, agents, forecaster, catalog.fallback, scene, drafts, [])
+    warnings = input_warnings(request, agents, raster)
+    plan = Plan(options, agents, forecaster, catalog.fallback, scene, drafts, [], warnings)
     plan.check_strict()
     plan.warnings.extend(_warnings(plan))
+    plan.warnings.extend(of_context_agents(warnings, [draft.index for draft in drafts]))
     plan.add_groups(draft for draft in drafts if draft.forecaster is not None)
     return plan
 
@@ -236,7 +241,7 @@ def _build_scene(
             if observed_now[row]
             else f"the newest state is more than {MAX_AGE} s old"
         )
-        faults[index] = Fault(f"agents[{index}].states", detail)
+        faults.setdefault(index, Fault(f"agents[{index}].states", detail))
     if not kept.any():
         return None, {}, faults
     new_row = np.cumsum(kept) - 1

@@ -100,8 +100,10 @@ class Agents:
     """Flags of agents to forecast: [N]."""
     faults: dict[int, Fault]
     """First fault of each invalid agent, by index in the request."""
+    duplicates: frozenset[int]
+    """Indices of agents whose only fault is that others have the same id: they are seen as neighbours."""
     valid: Ints
-    """Indices of the valid agents in the request: [V]."""
+    """Indices of the valid agents in the request, duplicates among them: [V]."""
     types: Sequence[AgentType]
     """Types of the valid agents: [V]."""
     observations: Observations | None
@@ -242,13 +244,19 @@ def read_agents(request: pb.PredictRequest, settings: Settings) -> Agents:
             faults[index] = error.faults[0]
 
     valid = [index for index in whole if index not in faults]
+    uses = Counter(ids)
+    duplicates = frozenset(index for index in valid if uses[ids[index]] > 1)
+    observations = table.observations(faults) if valid else None
+    for index in duplicates:
+        faults[index] = Fault(f"agents[{index}].id", f"{uses[ids[index]]} agents share it")
     return Agents(
         ids=ids,
         predict=predict,
         faults=faults,
+        duplicates=duplicates,
         valid=np.array(valid, dtype=np.int64),
         types=[TYPES[agents[index].type] for index in valid],
-        observations=table.observations(faults) if valid else None,
+        observations=observations,
         patches=_by_row(images["map_patch"], valid),
         far_patches=_by_row(images["far_map_patch"], valid),
     )
@@ -289,15 +297,12 @@ def _by_row(images: Mapping[int, Bytes], valid: Sequence[int]) -> dict[int, Byte
 def _head_faults(request: pb.PredictRequest, ids: Sequence[str], settings: Settings) -> dict[int, Fault]:
     """Return the faults outside the contents of states and patches."""
     faults: dict[int, Fault] = {}
-    uses = Counter(ids)
     for index, (agent, agent_id) in enumerate(zip(request.agents, ids, strict=True)):
         path = f"agents[{index}]"
         if not agent_id:
             faults[index] = Fault(f"{path}.id", "is required")
         elif len(agent_id) > MAX_ID_LENGTH:
             faults[index] = Fault(f"{path}.id", id_too_long(agent_id))
-        elif uses[agent_id] > 1:
-            faults[index] = Fault(f"{path}.id", f"{uses[agent_id]} agents share it")
         elif agent.type == models_pb.AGENT_TYPE_UNSPECIFIED:
             faults[index] = Fault(f"{path}.type", "type is required")
         elif agent.type not in TYPES:

@@ -24,7 +24,7 @@ _SEVERITY = (
 
 
 def observation_updates(agents: Agents, models: tuple[Forecaster, Forecaster]) -> list[TrackUpdate]:
-    """Return all observations of a call, for the recall before the forecast.
+    """Return all observations of a call, for the recall before the forecast: one update per valid agent.
 
     Args:
         agents: the agents of the call.
@@ -42,6 +42,13 @@ def observation_updates(agents: Agents, models: tuple[Forecaster, Forecaster]) -
             (forecaster if kind in forecaster.info.agent_types else fallback).info.full_name,
         )
         for index, kind, observations in zip(agents.valid.tolist(), agents.types, packed, strict=True)
+    ]
+
+
+def unambiguous(agents: Agents, own: Sequence[TrackUpdate]) -> list[TrackUpdate]:
+    """Return the updates for the track memory: those of agents that share their id with no other."""
+    return [
+        one for index, one in zip(agents.valid.tolist(), own, strict=True) if index not in agents.duplicates
     ]
 
 
@@ -82,7 +89,7 @@ def forecast_updates(plan: Plan, remembered: bool) -> list[TrackUpdate]:
     added = []
     for index, kind, newest in zip(agents.valid.tolist(), agents.types, packed, strict=True):
         series, forecast = made.get(index, ("", b""))
-        if remembered and not forecast:
+        if index in agents.duplicates or (remembered and not forecast):
             continue
         observations = b"" if remembered else newest
         steps = plan.options.steps if forecast else 0

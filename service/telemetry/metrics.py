@@ -1,6 +1,6 @@
 """Prometheus metrics. Each server object has its own registry, so that one process can run several."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from time import perf_counter
 
@@ -73,6 +73,12 @@ class Metrics:
             ["model"],
             registry=self.registry,
         )
+        self.input_warnings = Counter(
+            "forecast_input_warnings_total",
+            "Forecasts with a warning that the agent's input contradicts itself, by the warning's code.",
+            ["code"],
+            registry=self.registry,
+        )
         self.nonfinite = Counter(
             "forecast_nonfinite_total",
             "Forecasts discarded because the model returned a non-finite number.",
@@ -124,6 +130,11 @@ class Metrics:
                 error_m = info.benchmark.get(f"fde_ml_{seconds}s_m")
                 if error_m is not None:
                     self.benchmark.labels(info.name, f"{seconds}").set(error_m)
+
+    def begin_input_warnings(self, codes: Iterable[str]) -> None:
+        """Start the counters of warnings of the input at 0, for each code."""
+        for code in codes:
+            self.input_warnings.labels(code)
 
     @contextmanager
     def call(self, transport: str, method: str, timed: bool = True) -> Iterator["Call"]:

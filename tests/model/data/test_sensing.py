@@ -7,7 +7,7 @@ import pytest
 
 from model.data.protocols import SceneFrames
 from model.data.scenes import SceneRecord
-from model.data.sensing import SensedFrames, _spline
+from model.data.sensing import SensedFrames, spline
 from model.forecaster import Protocol
 from tests.model.data.records import record
 
@@ -79,15 +79,15 @@ def test_the_spline_is_exact_for_steady_acceleration_and_meets_its_poses() -> No
     seconds = 0.5 * np.arange(-5, 1)
     positions = np.stack([10 * seconds + 0.75 * seconds**2, -0.5 * seconds**2], axis=-1)
     ages = np.linspace(2.0, 0.0, 21)
-    place, velocity = _spline(positions, ages)
+    place, velocity = spline(positions, ages)
     np.testing.assert_allclose(place, np.stack([-10 * ages + 0.75 * ages**2, -0.5 * ages**2], -1), atol=1e-9)
     np.testing.assert_allclose(velocity, np.stack([10 - 1.5 * ages, ages], axis=-1), atol=1e-9)
     wild = np.random.default_rng(0).normal(size=(6, 2))
-    np.testing.assert_allclose(_spline(wild, np.array([1.0, 0.5, 0.0]))[0], wild[-3:], atol=1e-12)
+    np.testing.assert_allclose(spline(wild, np.array([1.0, 0.5, 0.0]))[0], wild[-3:], atol=1e-12)
 
 
 def test_one_pose_tells_no_velocity() -> None:
-    place, velocity = _spline(np.array([[3.0, 4.0]]), np.zeros(2))
+    place, velocity = spline(np.array([[3.0, 4.0]]), np.zeros(2))
     assert place.tolist() == [[3.0, 4.0]] * 2
     assert np.isnan(velocity).all()
 

@@ -55,6 +55,7 @@ def plan_of(groups: list[Group], **options: Any) -> Plan:
         scene=None,
         drafts=drafts,
         warnings=["a warning"],
+        input_warnings={},
         groups=groups,
     )
 

@@ -86,7 +86,9 @@ class _ForecastStatusEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_Foreca
     FORECAST_STATUS_FALLBACK: _ForecastStatus.ValueType  # 3
     """A forecast by another model, named in `model`; `detail` says why."""
     FORECAST_STATUS_INVALID: _ForecastStatus.ValueType  # 4
-    """No forecast: `field` is wrong, `detail` says how. The agent was left out as a neighbour, too."""
+    """No forecast: `field` is wrong, `detail` says how. The agent was left out as a neighbour, too, unless all
+    that is wrong is that others have its id.
+    """
 
 class ForecastStatus(_ForecastStatus, metaclass=_ForecastStatusEnumTypeWrapper): ...
 
@@ -97,8 +99,75 @@ FORECAST_STATUS_SHORT_HISTORY: ForecastStatus.ValueType  # 2
 FORECAST_STATUS_FALLBACK: ForecastStatus.ValueType  # 3
 """A forecast by another model, named in `model`; `detail` says why."""
 FORECAST_STATUS_INVALID: ForecastStatus.ValueType  # 4
-"""No forecast: `field` is wrong, `detail` says how. The agent was left out as a neighbour, too."""
+"""No forecast: `field` is wrong, `detail` says how. The agent was left out as a neighbour, too, unless all
+that is wrong is that others have its id.
+"""
 Global___ForecastStatus: _TypeAlias = ForecastStatus  # noqa: Y015
+
+class _InputWarningCode:
+    ValueType = _typing.NewType("ValueType", _builtins.int)
+    V: _TypeAlias = ValueType  # noqa: Y015
+
+class _InputWarningCodeEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_InputWarningCode.ValueType], _builtins.type):
+    DESCRIPTOR: _descriptor.EnumDescriptor
+    INPUT_WARNING_CODE_UNSPECIFIED: _InputWarningCode.ValueType  # 0
+    INPUT_WARNING_CODE_VELOCITY_MISMATCH: _InputWarningCode.ValueType  # 1
+    """The given velocities are not those of the positions: another sign, unit or frame."""
+    INPUT_WARNING_CODE_HEADING_MISMATCH: _InputWarningCode.ValueType  # 2
+    """The agent moves, but not where its headings point."""
+    INPUT_WARNING_CODE_HEADING_IN_DEGREES: _InputWarningCode.ValueType  # 3
+    """The headings of this agent, or of most in the scene, fit the motion if taken as degrees."""
+    INPUT_WARNING_CODE_HEADING_MIRRORED: _InputWarningCode.ValueType  # 4
+    """They fit the motion if y is mirrored: clockwise headings, or an image's y axis."""
+    INPUT_WARNING_CODE_HEADING_FLIPPED: _InputWarningCode.ValueType  # 5
+    """One heading points backwards, those around it do not."""
+    INPUT_WARNING_CODE_OFF_MAP: _InputWarningCode.ValueType  # 6
+    """This agent, and with it most that move, is off the driveable area or off the map: the map is mirrored,
+    shifted or in another frame.
+    """
+    INPUT_WARNING_CODE_OTHER_OBJECT: _InputWarningCode.ValueType  # 7
+    """The positions jump as no agent does: the id was given to another one."""
+    INPUT_WARNING_CODE_TYPE_CHANGED: _InputWarningCode.ValueType  # 8
+    """The track memory knows the id as another type. The track goes on."""
+    INPUT_WARNING_CODE_DUPLICATE_ID: _InputWarningCode.ValueType  # 9
+    """Several agents of the request have this id. None is forecast; each is a neighbour to the others."""
+    INPUT_WARNING_CODE_TIME_BACKWARDS: _InputWarningCode.ValueType  # 10
+    """The request's time is before that of an earlier call of the scene: a frame that comes late, or a clock
+    that was set back.
+    """
+    INPUT_WARNING_CODE_TIME_UNIT: _InputWarningCode.ValueType  # 11
+    """The times are in milliseconds, microseconds or nanoseconds, by the gaps between them."""
+
+class InputWarningCode(_InputWarningCode, metaclass=_InputWarningCodeEnumTypeWrapper): ...
+
+INPUT_WARNING_CODE_UNSPECIFIED: InputWarningCode.ValueType  # 0
+INPUT_WARNING_CODE_VELOCITY_MISMATCH: InputWarningCode.ValueType  # 1
+"""The given velocities are not those of the positions: another sign, unit or frame."""
+INPUT_WARNING_CODE_HEADING_MISMATCH: InputWarningCode.ValueType  # 2
+"""The agent moves, but not where its headings point."""
+INPUT_WARNING_CODE_HEADING_IN_DEGREES: InputWarningCode.ValueType  # 3
+"""The headings of this agent, or of most in the scene, fit the motion if taken as degrees."""
+INPUT_WARNING_CODE_HEADING_MIRRORED: InputWarningCode.ValueType  # 4
+"""They fit the motion if y is mirrored: clockwise headings, or an image's y axis."""
+INPUT_WARNING_CODE_HEADING_FLIPPED: InputWarningCode.ValueType  # 5
+"""One heading points backwards, those around it do not."""
+INPUT_WARNING_CODE_OFF_MAP: InputWarningCode.ValueType  # 6
+"""This agent, and with it most that move, is off the driveable area or off the map: the map is mirrored,
+shifted or in another frame.
+"""
+INPUT_WARNING_CODE_OTHER_OBJECT: InputWarningCode.ValueType  # 7
+"""The positions jump as no agent does: the id was given to another one."""
+INPUT_WARNING_CODE_TYPE_CHANGED: InputWarningCode.ValueType  # 8
+"""The track memory knows the id as another type. The track goes on."""
+INPUT_WARNING_CODE_DUPLICATE_ID: InputWarningCode.ValueType  # 9
+"""Several agents of the request have this id. None is forecast; each is a neighbour to the others."""
+INPUT_WARNING_CODE_TIME_BACKWARDS: InputWarningCode.ValueType  # 10
+"""The request's time is before that of an earlier call of the scene: a frame that comes late, or a clock
+that was set back.
+"""
+INPUT_WARNING_CODE_TIME_UNIT: InputWarningCode.ValueType  # 11
+"""The times are in milliseconds, microseconds or nanoseconds, by the gaps between them."""
+Global___InputWarningCode: _TypeAlias = InputWarningCode  # noqa: Y015
 
 @_typing.final
 class PredictRequest(_message.Message):
@@ -161,7 +230,9 @@ class Agent(_message.Message):
     MAP_PATCH_FIELD_NUMBER: _builtins.int
     FAR_MAP_PATCH_FIELD_NUMBER: _builtins.int
     id: _builtins.str
-    """Unique within the request, 1 to 128 characters."""
+    """Unique within the request, 1 to 128 characters. Agents that share an id are not forecast, and not
+    remembered; the others still see them as neighbours.
+    """
     type: _model_service_pb2.AgentType.ValueType
     predict: _builtins.bool
     """False: the agent is a neighbour for the others and gets no forecast. Default true."""
@@ -510,6 +581,7 @@ class AgentForecast(_message.Message):
     SAMPLES_FIELD_NUMBER: _builtins.int
     TRACKING_FIELD_NUMBER: _builtins.int
     CONSISTENCY_FIELD_NUMBER: _builtins.int
+    WARNINGS_FIELD_NUMBER: _builtins.int
     agent_id: _builtins.str
     status: Global___ForecastStatus.ValueType
     detail: _builtins.str
@@ -559,6 +631,12 @@ class AgentForecast(_message.Message):
         it before. Absent where nothing is remembered.
         """
 
+    @_builtins.property
+    def warnings(self) -> _containers.RepeatedCompositeFieldContainer[Global___InputWarning]:
+        """What of the agent's input contradicts itself, whatever the status. The forecast follows the input all the
+        same; at most one warning of each code.
+        """
+
     def __init__(
         self,
         *,
@@ -577,14 +655,44 @@ class AgentForecast(_message.Message):
         samples: _abc.Iterable[_builtins.float] | None = ...,
         tracking: _consistency_service_pb2.TrackingStatus.ValueType = ...,
         consistency: _consistency_service_pb2.InstantConsistency | None = ...,
+        warnings: _abc.Iterable[Global___InputWarning] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["consistency", b"consistency", "model", b"model"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "consistency", b"consistency", "covariances", b"covariances", "detail", b"detail", "field", b"field", "history_frames", b"history_frames", "means", b"means", "mode_ids", b"mode_ids", "model", b"model", "most_likely_mode", b"most_likely_mode", "remaining_weight", b"remaining_weight", "samples", b"samples", "status", b"status", "tracking", b"tracking", "weights", b"weights"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["agent_id", b"agent_id", "consistency", b"consistency", "covariances", b"covariances", "detail", b"detail", "field", b"field", "history_frames", b"history_frames", "means", b"means", "mode_ids", b"mode_ids", "model", b"model", "most_likely_mode", b"most_likely_mode", "remaining_weight", b"remaining_weight", "samples", b"samples", "status", b"status", "tracking", b"tracking", "warnings", b"warnings", "weights", b"weights"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
 Global___AgentForecast: _TypeAlias = AgentForecast  # noqa: Y015
+
+@_typing.final
+class InputWarning(_message.Message):
+    """A contradiction in an agent's input. docs/warnings.md has the thresholds, and how often each is wrong."""
+
+    DESCRIPTOR: _descriptor.Descriptor
+
+    CODE_FIELD_NUMBER: _builtins.int
+    DETAIL_FIELD_NUMBER: _builtins.int
+    FIELD_FIELD_NUMBER: _builtins.int
+    code: Global___InputWarningCode.ValueType
+    detail: _builtins.str
+    """What contradicts what, with numbers."""
+    field: _builtins.str
+    """The field, e.g. "agents[3].states[4].velocity_x". What lies in the track memory is "agents[3].states"."""
+    def __init__(
+        self,
+        *,
+        code: Global___InputWarningCode.ValueType = ...,
+        detail: _builtins.str = ...,
+        field: _builtins.str = ...,
+    ) -> None: ...
+    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["code", b"code", "detail", b"detail", "field", b"field"]  # noqa: Y015
+    def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
+    def WhichOneof(self, oneof_group: _Never) -> None: ...
+
+Global___InputWarning: _TypeAlias = InputWarning  # noqa: Y015
 
 @_typing.final
 class PredictResponse(_message.Message):
