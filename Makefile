@@ -3,13 +3,16 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 NUSCENES := .venv-nuscenes
+PEERS := $(patsubst loadtest/peers/requirements-%.txt,%,$(wildcard loadtest/peers/requirements-*.txt))
+# Triton's Python backend needs libpython as a shared library, as Debian's Python has it.
+PEERS_PYTHON ?= /usr/bin/python3
 BUF := npm exec --yes --package=@bufbuild/buf@1.75.0 -- buf
 # For example PIP_FLAGS="--extra-index-url https://download.pytorch.org/whl/cpu" for the CPU build of torch.
 PIP_FLAGS ?=
 PROTOC := PATH="$(CURDIR)/$(BIN):$$PATH" python -m grpc_tools.protoc
 PROTOS := $(wildcard proto/cab/forecast/v1/*.proto)
 
-.PHONY: install run test test-nuscenes bench loadtest faults lint format docs proto proto-check proto-lint lock clean
+.PHONY: install run test test-nuscenes bench loadtest peers peers-install faults lint format docs proto proto-check proto-lint lock clean
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -54,6 +57,16 @@ bench: install  ## measure the forward pass (relative to matmul), startup time, 
 loadtest: install  ## short load tests of all scenarios: overload, a restart, slow uploads … (a few minutes)
 	$(BIN)/python -m loadtest all --seconds 10 --out build/loadtest
 
+.venv-peers/%/.installed: loadtest/peers/requirements-%.txt
+	test -x .venv-peers/$*/bin/python || $(PEERS_PYTHON) -m venv .venv-peers/$*
+	.venv-peers/$*/bin/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) -r $<
+	touch $@
+
+peers-install: $(PEERS:%=.venv-peers/%/.installed)  ## create an environment for each peer, in .venv-peers
+
+peers: install peers-install  ## compare with other servers around the same network; tables in build/peers
+	$(BIN)/python -m loadtest.peers --out build/peers
+
 faults: install  ## forecast while the track memory is killed, full, slow or hanging; needs redis-server
 	$(BIN)/python -m loadtest.redis_faults
 
@@ -77,4 +90,4 @@ lock: install  ## write the installed versions to constraints.txt
 	$(BIN)/python -m pip freeze --exclude-editable | sed 's/+cpu$$//' > constraints.txt
 
 clean:  ## remove the environments and caches
-	rm -rf $(VENV) $(NUSCENES) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) $(NUSCENES) .venv-peers .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from google.protobuf import json_format
-from google.protobuf.message import DecodeError
+from google.protobuf.message import DecodeError, Message
 
 from cab.forecast.v1.prediction_service_pb2 import PredictRequest, PredictResponse
 from cab_forecast import predict_request, scene_raster
@@ -86,8 +86,8 @@ def made_up_requests(
     return requests
 
 
-def encode(message: PredictRequest, encoding: Encoding) -> bytes:
-    """Return the body of a request."""
+def encode(message: Message, encoding: Encoding) -> bytes:
+    """Return a request or response in an encoding."""
     if encoding is Encoding.PROTOBUF:
         return message.SerializeToString()
     return json_format.MessageToJson(message, indent=None).encode()
@@ -211,31 +211,55 @@ def scene_of(message: PredictRequest, frames: int) -> Scene:
     return Scene([AgentType.VEHICLE] * agents, resample(observations, message.time, frames), raster)
 
 
+def difference(
+    ids: Sequence[str], weights: Floats, means: Floats, covariances: Floats, mixture: TrajectoryMixture
+) -> str:
+    """Return how forecasts differ from a mixture by more than an answer may; empty: they do not.
+
+    Args:
+        ids: names of the N agents.
+        weights: [N, K].
+        means: [N, K, T, 2], m, in the ground frame.
+        covariances: [N, K, T, 2, 2], m²; only the variances are compared.
+        mixture: the mixture that is expected.
+    """
+    expected_weights: Floats = mixture.log_weights.double().softmax(dim=1).numpy()
+    variances = (0, 1), (0, 1)
+    expected_sigma = np.sqrt(mixture.covariances.double().numpy()[..., *variances])
+    sigma = np.sqrt(np.maximum(covariances[..., *variances], 0))
+    weight_errors = np.abs(weights - expected_weights).max(axis=1)
+    position_errors = np.abs(means - mixture.world_means.numpy()).max(axis=(1, 2, 3))
+    sigma_errors = np.abs(sigma - expected_sigma).max(axis=(1, 2, 3))
+    # Written so that a NaN is a fault too
+    right = (
+        (weight_errors <= MAX_WEIGHT_ERROR)
+        & (position_errors <= MAX_POSITION_ERROR)
+        & (sigma_errors <= MAX_POSITION_ERROR)
+    )
+    if right.all():
+        return ""
+    row = int(np.argmin(right))
+    return (
+        f"{ids[row]}: off by {position_errors[row]:.2g} m, in weights by {weight_errors[row]:.2g}, "
+        f"in σ by {sigma_errors[row]:.2g} m"
+    )
+
+
 def _difference(answer: PredictResponse, mixture: TrajectoryMixture) -> str:
-    weights: Floats = mixture.log_weights.double().softmax(dim=1).numpy()
-    means: Floats = mixture.world_means.numpy()
-    covariances: Floats = mixture.covariances.double().numpy()
+    agents, modes, steps = mixture.means.shape[:3]
+    weights = np.empty((agents, modes))
+    means = np.empty((agents, modes, steps, 2))
+    covariances = np.empty((agents, modes, steps, 3))
     for row, forecast in enumerate(answer.forecasts):
         try:
-            given_means = np.array(forecast.means).reshape(means[row].shape)
-            given_covariances = np.array(forecast.covariances).reshape(*means.shape[1:3], 3)
-            weight_error = np.abs(np.array(forecast.weights) - weights[row]).max()
+            weights[row] = np.array(forecast.weights).reshape(modes)
+            means[row] = np.array(forecast.means).reshape(modes, steps, 2)
+            covariances[row] = np.array(forecast.covariances).reshape(modes, steps, 3)
         except ValueError:
             return f"{forecast.agent_id}: there are too few or too many numbers"
-        position_error = np.abs(given_means - means[row]).max()
-        given_sigma = np.sqrt(np.maximum(given_covariances[..., [0, 2]], 0))
-        sigma_error = np.abs(given_sigma - np.sqrt(covariances[row][..., [0, 1], [0, 1]])).max()
-        # Written so that a NaN is a fault too
-        if not (
-            weight_error <= MAX_WEIGHT_ERROR
-            and position_error <= MAX_POSITION_ERROR
-            and sigma_error <= MAX_POSITION_ERROR
-        ):
-            return (
-                f"{forecast.agent_id}: off by {position_error:.2g} m, in weights by {weight_error:.2g}, "
-                f"in σ by {sigma_error:.2g} m"
-            )
-    return ""
+    symmetric = covariances[..., [0, 1, 1, 2]].reshape(agents, modes, steps, 2, 2)
+    ids = [forecast.agent_id for forecast in answer.forecasts]
+    return difference(ids, weights, means, symmetric, mixture)
 
 
 def _roads(seed: int) -> Bytes:

@@ -1,4 +1,4 @@
-"""Predict calls with encoded bodies over gRPC and REST: no message is built or parsed on the way.
+"""Calls with encoded bodies over gRPC and HTTP: no message is built or parsed on the way.
 
 A client library would take more time per call than the measured server has cores to spare.
 """
@@ -49,7 +49,7 @@ class Reply(NamedTuple):
 
 
 class Wire(Protocol):
-    """Connection to the Predict method of a server."""
+    """Connection to a method of a server."""
 
     async def call(self, body: bytes, time_left: float | None) -> Reply:
         """Send a request and return the reply.
@@ -71,22 +71,27 @@ class Transport(StrEnum):
 
 
 def connect(transport: Transport, address: str, encoding: Encoding) -> Wire:
-    """Return a connection to a server.
+    """Return a connection to the Predict method of a server.
 
     Args:
         transport: gRPC or REST.
         address: HOST:PORT.
         encoding: encoding of the bodies over REST.
     """
-    return GrpcWire(address) if transport is Transport.GRPC else RestWire(address, encoding)
+    return GrpcWire(address) if transport is Transport.GRPC else RestWire(address, encoding.media_type)
 
 
 class GrpcWire:
-    """Calls over a few gRPC channels in turn."""
+    """Calls over a few gRPC channels in turn.
 
-    def __init__(self, address: str) -> None:
+    Args:
+        address: HOST:PORT.
+        method: full name of the method, ``/package.Service/Method``.
+    """
+
+    def __init__(self, address: str, method: str = PREDICT.rpc) -> None:
         self._channels = [aio.insecure_channel(address, _OPTIONS) for _ in range(CHANNELS)]
-        methods: list[Any] = [channel.unary_unary(PREDICT.rpc, None, None) for channel in self._channels]
+        methods: list[Any] = [channel.unary_unary(method, None, None) for channel in self._channels]
         self._methods = itertools.cycle(methods)
 
     async def call(self, body: bytes, time_left: float | None) -> Reply:
@@ -106,14 +111,20 @@ class GrpcWire:
 
 
 class RestWire:
-    """Calls over as many HTTP/1.1 connections as there are calls at a time."""
+    """Calls over as many HTTP/1.1 connections as there are calls at a time.
 
-    def __init__(self, address: str, encoding: Encoding) -> None:
+    Args:
+        address: HOST:PORT.
+        media_type: media type of requests and answers.
+        path: path of the method.
+    """
+
+    def __init__(self, address: str, media_type: str, path: str = PREDICT.path) -> None:
         self._host, _, port = address.rpartition(":")
         self._port = int(port)
         self._head = (
-            f"POST {PREDICT.path} HTTP/1.1\r\nHost: {address}\r\n"
-            f"Content-Type: {encoding.media_type}\r\nAccept: {encoding.media_type}, */*;q=0.1\r\n"
+            f"POST {path} HTTP/1.1\r\nHost: {address}\r\n"
+            f"Content-Type: {media_type}\r\nAccept: {media_type}, */*;q=0.1\r\n"
         )
         self._idle: list[tuple[asyncio.StreamReader, asyncio.StreamWriter]] = []
 

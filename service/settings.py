@@ -1,8 +1,7 @@
 """Settings of the server, by priority: flags, ``FORECAST_*`` variables, a TOML file, defaults."""
 
-import ipaddress
 import os
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -17,7 +16,7 @@ from pydantic_settings import (
     TomlConfigSettingsSource,
 )
 
-from service.environment import CONFIG, PREFIX, no_such_setting, unknown_variable
+from service.environment import CONFIG, PREFIX, unknown_variable
 from service.redis_url import parse_address
 
 FALLBACK_MODEL = "constant-velocity-yaw"
@@ -62,12 +61,6 @@ class Settings(BaseSettings):
     """Folder of checkpoints; None: the bundled ones, if any."""
     default_model: str | None = None
     """Model of requests that name none; None: "cab" if loaded, else "kalman"."""
-    default_models: Annotated[dict[str, str], NoDecode] = Field(default_factory=dict)
-    """Default models of some callers by the name of their API key, ``key-name=model,…`` in the environment;
-    all others have ``default_model``."""
-    reload_seconds: float | None = Field(default=None, ge=0.1)
-    """Seconds between looks at the folder of models: what has changed there is loaded. None: it is read again
-    only on SIGHUP and by ReloadModels."""
     allow_paper_protocol: bool = False
     """Flag for loading models trained by the paper protocol, which warn in every response. Otherwise they are
     skipped, and a folder without other models is refused."""
@@ -151,19 +144,6 @@ class Settings(BaseSettings):
             return tuple(_strip_token(token) for token in value)
         return value
 
-    @field_validator("default_models", mode="before")
-    @classmethod
-    def _split_default_models(cls, value: object) -> object:
-        if not isinstance(value, str):
-            return value
-        pairs = {}
-        for pair in filter(None, map(str.strip, value.split(","))):
-            key, equals, model = (part.strip() for part in pair.partition("="))
-            if not (key and equals and model):
-                raise ValueError(f'"{pair}" is not key-name=model')
-            pairs[key] = model
-        return pairs
-
     @field_validator("log_level", mode="before")
     @classmethod
     def _lower_level(cls, value: object) -> object:
@@ -229,9 +209,7 @@ def load(config: Path | None = None, **flags: Any) -> Settings:
     try:
         settings = FromFile(**given)
     except ValidationError as error:
-        raise SettingsError(
-            "; ".join(_describe(problem, given, file) for problem in error.errors())
-        ) from None
+        raise SettingsError("; ".join(_describe(problem) for problem in error.errors())) from None
     except ValueError as error:  # the file is no valid TOML
         raise SettingsError(f"{file}: {error}") from None
     return settings
@@ -253,27 +231,9 @@ def _strip_token(token: object) -> object:
     return stripped
 
 
-def _describe(problem: ErrorDetails, flags: Collection[str], file: Path | None) -> str:
-    """Return a problem with the place of the value: a flag, a variable or the file.
-
-    Args:
-        problem: the problem.
-        flags: the settings that flags give, which go before variables.
-        file: the TOML file, the last source; None: there is none.
-    """
+def _describe(problem: ErrorDetails) -> str:
     place = ".".join(map(str, problem["loc"])) or "settings"
-    text = f"{place}: {problem['msg'].removeprefix('Value error, ')}"
-    if not problem["loc"]:
-        return text
-    name = str(problem["loc"][0])
-    if problem["type"] == "extra_forbidden":
-        text = f"{name}: {no_such_setting(name, Settings.model_fields)}"
-    variables = {variable.upper() for variable in os.environ}
-    if name in flags:
-        return text
-    if PREFIX + name.upper() in variables:
-        return f"{text} (in the variable {PREFIX}{name.upper()})"
-    return text if file is None else f"{file}: {text}"
+    return f"{place}: {problem['msg'].removeprefix('Value error, ')}"
 
 
 def split_address(address: str) -> tuple[str, int]:
@@ -286,18 +246,6 @@ def split_address(address: str) -> tuple[str, int]:
     if not colon or not host or not port.isdecimal() or int(port) > 65535:
         raise ValueError(f'"{address}" is not HOST:PORT')
     return host.removeprefix("[").removesuffix("]"), int(port)
-
-
-def is_local(settings: Settings) -> bool:
-    """Return whether both ports listen on this machine's loopback alone."""
-    return all(_is_loopback(split_address(address)[0]) for address in (settings.http, settings.grpc))
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def bundled_models() -> Path | None:
