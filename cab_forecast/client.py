@@ -6,6 +6,7 @@ from typing import Self
 
 import tenacity
 
+from cab.forecast.v1.admin_service_pb2 import ReloadModelsRequest, ReloadModelsResponse
 from cab.forecast.v1.consistency_service_pb2 import (
     GetAgentConsistencyRequest,
     GetSceneConsistencyRequest,
@@ -26,6 +27,7 @@ from cab.forecast.v1.routes import (
     LIST_MODEL_CONSISTENCY,
     LIST_MODELS,
     PREDICT,
+    RELOAD_MODELS,
     RESET_SCENE,
     WATCH_SCENE,
     Request,
@@ -187,6 +189,18 @@ class Client:
         )
         return stream
 
+    def reload_models(self, timeout: float | None = None) -> ReloadModelsResponse:
+        """Make the server read its folder of models again: what took over, what is gone, what was refused.
+
+        The server goes on with the reload if the timeout passes meanwhile.
+
+        Raises:
+            Unauthenticated: the token does not permit it.
+            ForecastError: the call failed; the subclass says why. With the reason ``RELOAD_REFUSED`` the
+                models are as they were.
+        """
+        return self._call(RELOAD_MODELS, ReloadModelsRequest(), timeout)
+
     def close(self) -> None:
         """Close the connections; later calls raise RuntimeError."""
         self._settings.closed = True
@@ -267,6 +281,10 @@ class AsyncClient:
     async def reset_scene(self, scene_id: str, timeout: float | None = None) -> int:  # noqa: ASYNC109
         """See ``Client.reset_scene``."""
         return (await self._call(RESET_SCENE, ResetSceneRequest(scene_id=scene_id), timeout)).agents
+
+    async def reload_models(self, timeout: float | None = None) -> ReloadModelsResponse:  # noqa: ASYNC109
+        """See ``Client.reload_models``."""
+        return await self._call(RELOAD_MODELS, ReloadModelsRequest(), timeout)
 
     def watch_scene(self, scene_id: str, timeout: float | None = None) -> AsyncStream[WatchSceneResponse]:
         """See ``Client.watch_scene``.

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from cli import benchmark, consistency, convert, evaluate, predict, serve, train
+from cli import benchmark, consistency, convert, evaluate, predict, reload, serve, train
 
 app = typer.Typer(
     name="cab-forecast",
@@ -32,6 +32,7 @@ def _options(
 
 serve.register(app)
 predict.register(app)
+reload.register(app)
 consistency.register(app)
 convert.register(app)
 train.register(app)

@@ -153,9 +153,13 @@ def load_checkpoints(folder: Path) -> Iterator[Checkpoint]:
 
     if not folder.is_dir():
         raise CheckpointError(folder, "there is no such folder of checkpoints")
-    for one in sorted(folder.iterdir()):
-        if one.is_dir() and not one.name.startswith("."):
-            yield load_checkpoint(one)
+    for one in checkpoint_folders(folder):
+        yield load_checkpoint(one)
+
+
+def checkpoint_folders(folder: Path) -> list[Path]:
+    """Return the folders in a folder of checkpoints, by name, but none whose name begins with a dot."""
+    return [one for one in sorted(folder.iterdir()) if one.is_dir() and not one.name.startswith(".")]
 
 
 def _refuse(checkpoint: Checkpoint) -> NoReturn:

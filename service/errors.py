@@ -89,6 +89,24 @@ class Unauthenticated(ServiceError):
     title = "Credentials missing or wrong"
 
 
+class PermissionDenied(ServiceError):
+    """Error of a call that the caller may not make."""
+
+    code = "PERMISSION_DENIED"
+    http_status = 403
+    reason = "MISSING_SCOPE"
+    title = "Not permitted"
+
+
+class ReloadRefused(ServiceError):
+    """Error of a reload after which the server could not answer all its calls; nothing has changed."""
+
+    code = "FAILED_PRECONDITION"
+    http_status = 409
+    reason = "RELOAD_REFUSED"
+    title = "Reload refused"
+
+
 class UnknownModel(ServiceError):
     """Error of a call for a model that is not loaded."""
 
@@ -216,6 +234,8 @@ class UnsupportedMediaType(ServiceError):
 TABLE: tuple[type[ServiceError], ...] = (
     BadFields,
     Unauthenticated,
+    PermissionDenied,
+    ReloadRefused,
     UnknownModel,
     UnknownTrack,
     TooLarge,

@@ -1,6 +1,7 @@
 """Server: both transports over one data plane, from start to drain."""
 
 import asyncio
+import functools
 import signal
 import time
 from collections.abc import Callable
@@ -8,12 +9,12 @@ from contextlib import suppress
 
 import structlog
 
-from model.checkpoint import CheckpointError
-from model.registry import DuplicateModelError, Registry
-from service.errors import Unavailable
+from service.errors import ServiceError, Unavailable
 from service.predict.catalog import Models
 from service.predict.dataplane import DataPlane
-from service.settings import Engine, Settings, SettingsError, bundled_models
+from service.predict.models_folder import load_models, models_folder
+from service.predict.reload import Load
+from service.settings import Settings, SettingsError
 from service.telemetry.metrics import Metrics
 from service.transports.grpc.server import GrpcServer
 from service.transports.intake import Intake
@@ -37,21 +38,22 @@ class ServeError(Exception):
 class Server:
     """One server: ``start`` and ``stop`` it, or ``run`` it until a signal."""
 
-    def __init__(self, settings: Settings, load: Callable[[], Models] | None = None) -> None:
+    def __init__(self, settings: Settings, load: Load | None = None) -> None:
         """
         Args:
             settings: the settings.
-            load: returns the models; default: the baselines and the checkpoints that the settings name.
+            load: reads the models; default: the baselines and the checkpoints that the settings name.
         """
         self.settings = settings
         self.metrics = Metrics()
         self.dataplane = DataPlane(settings, self.metrics)
-        self._load = load or (lambda: _load_models(settings))
+        self._load = load or functools.partial(_load_models, settings)
         self.intake = Intake(settings, self.metrics)
         self._grpc = GrpcServer(self.dataplane, self.metrics, settings, self.intake)
         self._http = HttpServer(build_app(self.dataplane, self.metrics, settings, self.intake), settings)
         self._signalled = asyncio.Event()
         self._following: asyncio.Task[None] | None = None
+        self._reloading: asyncio.Task[None] | None = None
 
     @property
     def http_address(self) -> str:
@@ -73,7 +75,7 @@ class Server:
         try:
             await self._listen()
             await self.dataplane.open(self._load)
-        except (SettingsError, CheckpointError, DuplicateModelError) as error:
+        except SettingsError as error:
             await self.stop(drain=False)
             raise StartError(str(error)) from error
         except BaseException:
@@ -112,7 +114,7 @@ class Server:
         _log.info("stopped", seconds=round(time.perf_counter() - started, 3))
 
     async def run(self, when_ready: Callable[["Server"], None] | None = None) -> None:
-        """Serve until SIGTERM or SIGINT, then drain.
+        """Serve until SIGTERM or SIGINT, then drain; SIGHUP reads the models again.
 
         Args:
             when_ready: called in a thread once the server accepts calls.
@@ -124,6 +126,7 @@ class Server:
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self._on_signal, number)
+        loop.add_signal_handler(signal.SIGHUP, self._on_hangup)
         starting = asyncio.create_task(self.start())
         signalled = asyncio.create_task(self._signalled.wait())
         await asyncio.wait({starting, signalled}, return_when=asyncio.FIRST_COMPLETED)
@@ -151,6 +154,18 @@ class Server:
         _log.info("signal", name=signal.Signals(number).name)
         self.dataplane.refuse()
         self._signalled.set()
+
+    def _on_hangup(self) -> None:
+        _log.info("signal", name=signal.SIGHUP.name)
+        self._reloading = asyncio.create_task(self._reload(), name="hangup")
+
+    async def _reload(self) -> None:
+        try:
+            await self.dataplane.reload()
+        except ServiceError as error:
+            _log.warning("models not reloaded", reason=error.detail)
+        except Exception:
+            _log.exception("reload failed")
 
     async def _follow_readiness(self) -> None:
         """Keep gRPC health the same as ``/readyz``, which is evaluated whenever it is called."""
@@ -182,25 +197,23 @@ class Server:
         _log.info("listening", http=self.http_address, grpc=self.grpc_address, authentication=authentication)
 
 
-def _load_models(settings: Settings) -> Registry:
-    """Return the baselines and the checkpoints of the models folder."""
-    folder = settings.models or bundled_models()
-    if settings.models is not None and not settings.models.is_dir():
-        raise SettingsError(f"models: no such folder: {settings.models}")
-    registry = Registry.load(folder, allow_paper=settings.allow_paper_protocol)
-    if settings.engine is Engine.ONNXRUNTIME:
-        for info in registry.infos():
-            registry.get(info.full_name).compile(settings.threads)
-    _log.info(
-        "models loaded", folder=str(folder) if folder else None, models=[i.name for i in registry.infos()]
-    )
-    if registry.passed_over:
-        # The user may expect all models of an own folder to be served; not so of the bundled one
-        log = _log.info if settings.models is None else _log.warning
-        log(
-            "models skipped: trained by the paper protocol",
-            folder=str(folder),
-            models=[info.full_name for info in registry.passed_over],
-            load_with="--allow-paper-protocol or FORECAST_ALLOW_PAPER_PROTOCOL=true",
+def _load_models(settings: Settings, current: Models | None) -> Models:
+    """Read the models, and log at the start which there are."""
+    models = load_models(settings, current)
+    if current is None:
+        folder = models_folder(settings)
+        _log.info(
+            "models loaded",
+            folder=str(folder) if folder else None,
+            models=[info.full_name for info in models.infos()],
         )
-    return registry
+        if models.passed_over:
+            # The user may expect all models of an own folder to be served; not so of the bundled one
+            log = _log.info if settings.models is None else _log.warning
+            log(
+                "models skipped: trained by the paper protocol",
+                folder=str(folder),
+                models=[info.full_name for info in models.passed_over],
+                load_with="--allow-paper-protocol or FORECAST_ALLOW_PAPER_PROTOCOL=true",
+            )
+    return models

@@ -1,5 +1,6 @@
 """Settings of the server, by priority: flags, ``FORECAST_*`` variables, a TOML file, defaults."""
 
+import ipaddress
 import os
 from collections.abc import Sequence
 from enum import StrEnum
@@ -61,6 +62,12 @@ class Settings(BaseSettings):
     """Folder of checkpoints; None: the bundled ones, if any."""
     default_model: str | None = None
     """Model of requests that name none; None: "cab" if loaded, else "kalman"."""
+    default_models: Annotated[dict[str, str], NoDecode] = Field(default_factory=dict)
+    """Default models of some callers by the name of their API key, ``key-name=model,…`` in the environment;
+    all others have ``default_model``."""
+    reload_seconds: float | None = Field(default=None, ge=0.1)
+    """Seconds between looks at the folder of models: what has changed there is loaded. None: it is read again
+    only on SIGHUP and by ReloadModels."""
     allow_paper_protocol: bool = False
     """Flag for loading models trained by the paper protocol, which warn in every response. Otherwise they are
     skipped, and a folder without other models is refused."""
@@ -143,6 +150,19 @@ class Settings(BaseSettings):
         if isinstance(value, Sequence):
             return tuple(_strip_token(token) for token in value)
         return value
+
+    @field_validator("default_models", mode="before")
+    @classmethod
+    def _split_default_models(cls, value: object) -> object:
+        if not isinstance(value, str):
+            return value
+        pairs = {}
+        for pair in filter(None, map(str.strip, value.split(","))):
+            key, equals, model = (part.strip() for part in pair.partition("="))
+            if not (key and equals and model):
+                raise ValueError(f'"{pair}" is not key-name=model')
+            pairs[key] = model
+        return pairs
 
     @field_validator("log_level", mode="before")
     @classmethod
@@ -246,6 +266,18 @@ def split_address(address: str) -> tuple[str, int]:
     if not colon or not host or not port.isdecimal() or int(port) > 65535:
         raise ValueError(f'"{address}" is not HOST:PORT')
     return host.removeprefix("[").removesuffix("]"), int(port)
+
+
+def is_local(settings: Settings) -> bool:
+    """Return whether both ports listen on this machine's loopback alone."""
+    return all(_is_loopback(split_address(address)[0]) for address in (settings.http, settings.grpc))
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
 
 
 def bundled_models() -> Path | None:

@@ -19,7 +19,7 @@ from typing import NoReturn, TypeVar
 import structlog
 import torch
 
-from model.forecaster import Context, Forecaster, Prepared, complete
+from model.forecaster import Context, Forecaster, ModelInfo, Prepared, complete
 from model.mixture import TrajectoryMixture
 from model.scenes.scene import AgentType
 from service.errors import DeadlineExceeded, Internal, Overloaded, Unavailable
@@ -56,6 +56,8 @@ class Call:
         """Seconds of work for the call in helper threads."""
         self.places = 0
         """Number of queue places held."""
+        self.caller: str | None = None
+        """Name of the caller's key; None: there is none."""
 
     def remaining(self) -> float:
         """Return the seconds until the deadline; negative after it."""
@@ -298,10 +300,15 @@ class Batcher:
             raise
         return [_combine([entry.done.result() for entry in part]) for part in parts]
 
-    async def run_in_model_thread(self, job: Job) -> None:
-        """Run a job past the queue, for warm-up, and learn how long it takes."""
+    async def run_in_model_thread(self, job: Job) -> float:
+        """Run a job past the queue, for warm-up, and learn how long it takes: the seconds that it returns."""
         _, seconds = await self.call_in_model_thread(_forward, job, [job.inputs], job.steps, self._cutters)
         self._costs.measure(job.key, job.agents, seconds)
+        return seconds
+
+    def forget(self, forecasters: Iterable[Forecaster]) -> None:
+        """Forget how long the forwards of models take that are gone."""
+        self._costs.forget({id(forecaster) for forecaster in forecasters})
 
     async def call_in_model_thread(self, function: Callable[..., _T], *arguments: object) -> _T:
         """Call a function in the thread of the forward, past the queue."""
@@ -490,7 +497,22 @@ def _forward(
         agents = sum(map(len, parts))
         features = complete(parts, cutters if agents >= _CUT_IN_THREADS else None)
         mixture = job.forecaster.forecast(features, job.agent_type, job.context, steps)
-    info = job.forecaster.info
+    require_shapes(job.forecaster.info, mixture, agents, steps)
+    return mixture, time.perf_counter() - started
+
+
+def require_shapes(info: ModelInfo, mixture: TrajectoryMixture, agents: int, steps: int) -> None:
+    """Refuse a mixture of unexpected shapes.
+
+    Args:
+        info: the model that returned it.
+        mixture: the mixture.
+        agents: number of agents it must have.
+        steps: number of steps it must have.
+
+    Raises:
+        RuntimeError: the mixture is not one of these agents and steps and the model's modes.
+    """
     modes = info.modes
     expected = ((agents, modes), (agents, modes, steps, 2), (agents, modes, steps, 2, 2), (agents, 2))
     tensors = (mixture.log_weights, mixture.means, mixture.covariances, mixture.origin)
@@ -500,7 +522,6 @@ def _forward(
             f"{info.name} must forecast {agents} agents with {modes} modes of {steps} steps, but its "
             f"log-weights, means, covariances and origins are of the shapes {shapes}"
         )
-    return mixture, time.perf_counter() - started
 
 
 def _cut(mixture: TrajectoryMixture, steps: int) -> TrajectoryMixture:

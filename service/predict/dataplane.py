@@ -2,20 +2,20 @@
 
 import asyncio
 import os
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import structlog
 
+from cab.forecast.v1 import admin_service_pb2 as admin_pb
 from cab.forecast.v1 import model_service_pb2 as pb
-from service.errors import BadField, Unavailable
+from service.errors import BadField, PermissionDenied, Unavailable
 from service.lifecycle import Lifecycle, Phase
 from service.predict.batcher import Batcher
-from service.predict.catalog import Models, build_catalog, reference
+from service.predict.catalog import Catalog, reference
 from service.predict.pipeline import Pipeline
+from service.predict.reload import Load, Reloader
 from service.predict.torch_threads import set_helper_threads
-from service.predict.warmup import warm_up
-from service.settings import Settings
+from service.settings import Settings, is_local
 from service.telemetry.metrics import Metrics
 from service.tracking.collector import ConsistencyCollector, StoreMetrics
 from service.tracking.model_references import ModelReferences
@@ -65,6 +65,9 @@ class DataPlane:
         )
         """Calls of the consistency service."""
         self._pipeline = Pipeline(settings, metrics, self._lifecycle, self._batcher, tracker, self._threads)
+        self._reloader: Reloader | None = None
+        self._reloads: set[asyncio.Task[admin_pb.ReloadModelsResponse]] = set()
+        self._following: asyncio.Task[None] | None = None
         self.accept = self._pipeline.accept
         """See ``Pipeline.accept``."""
         self.predict = self._pipeline.predict
@@ -92,24 +95,56 @@ class DataPlane:
         if seconds > self._settings.max_timeout:
             raise Unavailable(f"a forward of the model has not returned for {seconds:.0f} s")
 
-    async def open(self, load: Callable[[], Models]) -> None:
+    async def open(self, load: Load) -> None:
         """Load and warm up the models, then accept calls.
 
         Args:
-            load: returns the models; called in a thread.
+            load: reads the models; called in a thread.
 
         Raises:
             SettingsError: a required model is missing.
             Exception: any exception of ``load``.
         """
-        models = await asyncio.get_running_loop().run_in_executor(self._threads, load)
-        catalog = build_catalog(models, self._settings.default_model)
+        self._reloader = Reloader(load, self._settings, self._batcher, self._metrics, self._take_over)
         self._batcher.start(self._lifecycle.fail)
-        await warm_up(self._batcher, catalog, self._settings.max_batch_agents)
-        self._metrics.set_models(models.infos(), catalog.default.info)
-        self._references.set_loaded(reference(info) for info in models.infos())
-        self._pipeline.catalog = catalog
+        await self._reloader.start()
         self._lifecycle.set_ready()
+        if self._settings.reload_seconds is not None:
+            self._following = asyncio.create_task(
+                self._reloader.follow(self._settings.reload_seconds), name="models"
+            )
+
+    async def reload_models(self, request: admin_pb.ReloadModelsRequest) -> admin_pb.ReloadModelsResponse:
+        """Read the models again; a caller that goes away does not end it.
+
+        Raises:
+            PermissionDenied: the caller may not administer the server.
+            ReloadRefused: the new models as a whole cannot be served; nothing has changed.
+            Unavailable: the server is not ready.
+        """
+        self._lifecycle.require_ready()
+        if not (self._settings.api_tokens or is_local(self._settings)):
+            raise PermissionDenied("without tokens, admin calls are answered on a loopback address only")
+        return await self.reload()
+
+    async def reload(self) -> admin_pb.ReloadModelsResponse:
+        """Read the models again, as ``reload_models`` does for every caller.
+
+        Raises:
+            ReloadRefused: the new models as a whole cannot be served; nothing has changed.
+            Unavailable: the server is not ready.
+        """
+        self._lifecycle.require_ready()
+        if self._reloader is None:
+            raise Unavailable("the models are not loaded yet")
+        reloading = asyncio.create_task(self._reloader.reload(), name="reload")
+        self._reloads.add(reloading)
+        reloading.add_done_callback(self._reloads.discard)
+        return await asyncio.shield(reloading)
+
+    def _take_over(self, catalog: Catalog) -> None:
+        self._references.set_loaded(reference(info) for info in catalog.models.infos())
+        self._pipeline.catalog = catalog
 
     def refuse(self) -> None:
         """Accept no more calls; those in progress go on, except streams of consistency events."""
@@ -134,6 +169,12 @@ class DataPlane:
     async def close(self) -> None:
         """Refuse new calls and release threads and connections."""
         self.refuse()
+        tasks = [*self._reloads, *([] if self._following is None else [self._following])]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        if self._reloader is not None:
+            self._reloader.close()
         await self._batcher.stop()
         await self._guard.close()
         await self._asking.close()

@@ -44,7 +44,7 @@ class Pipeline:
     """Stages of a Predict call. Used on one event loop; what takes milliseconds runs in threads."""
 
     catalog: Catalog
-    """Loaded models; set before the lifecycle becomes ready."""
+    """Models that calls begin with; set before the lifecycle becomes ready, and by reloads."""
 
     def __init__(
         self,
@@ -103,17 +103,18 @@ class Pipeline:
                 # Decode
                 message = await self._reader.read(request) if isinstance(request, EncodedRequest) else request
                 # Validate
-                forecaster = self.catalog.get(message.model)
+                catalog = self.catalog  # of the whole call, even if other models take over meanwhile
+                forecaster = catalog.get(message.model, call.caller)
                 options = read_options(message, forecaster.info, self._settings)
                 agents: Agents | None = None
                 recalled: TrackingResult | None = None
                 with self._batcher.hold_places(call, options.predicted):
                     # Recall
                     if options.recalls:
-                        agents, recalled = await self._recall(message, options, forecaster, call)
+                        agents, recalled = await self._recall(message, options, forecaster, catalog, call)
                     # Plan
                     plan = await self._in_thread(
-                        call, make_plan, message, options, forecaster, self.catalog, self._settings, agents
+                        call, make_plan, message, options, forecaster, catalog, self._settings, agents
                     )
                     # Batch
                     await self._forecast(plan, call)
@@ -129,17 +130,22 @@ class Pipeline:
         return response
 
     async def _recall(
-        self, request: pb.PredictRequest, options: Options, forecaster: Forecaster, call: Call
+        self,
+        request: pb.PredictRequest,
+        options: Options,
+        forecaster: Forecaster,
+        catalog: Catalog,
+        call: Call,
     ) -> tuple[Agents, TrackingResult]:
         """Return the agents with their histories from the track memory, and its response."""
         agents = await self._in_thread(call, read_agents, request, self._settings)
-        own = observation_updates(agents, (forecaster, self.catalog.fallback))
+        own = observation_updates(agents, (forecaster, catalog.fallback))
         tracked = await self._tracker.exchange(
             options.scene_id,
             options.time,
             unambiguous(agents, own),
             call.remaining() - _RESERVE,
-            history_s=history_seconds(frames_of(forecaster, self.catalog)),
+            history_s=history_seconds(frames_of(forecaster, catalog)),
             latest=options.consistency,
         )
         return with_histories(agents, own, tracked.histories), tracked

@@ -10,7 +10,7 @@ import itertools
 import math
 from bisect import bisect_left, bisect_right, insort
 from collections import Counter
-from collections.abc import Hashable, Iterator
+from collections.abc import Container, Hashable, Iterator
 from typing import Generic, Protocol, TypeVar
 
 _FIRST_RATE = 500.0
@@ -90,6 +90,14 @@ class CostModel:
         size = agents.bit_length()
         known[size] = known.get(size, rate) + _SMOOTHING * (rate - known.get(size, rate))
         self._last_key = key
+
+    def forget(self, models: Container[Hashable]) -> None:
+        """Forget some models, the first part of their keys."""
+        gone = [key for key in self._rates if isinstance(key, tuple) and key[0] in models]
+        for key in gone:
+            del self._rates[key]
+        if self._last_key in gone:
+            self._last_key = next(iter(self._rates), None)
 
     def measure_around(self, seconds: float) -> None:
         """Learn from a call that was answered."""

@@ -106,6 +106,14 @@ class Metrics:
             ["name", "version", "protocol", "default"],
             registry=self.registry,
         )
+        self.reloads = Counter(
+            "forecast_model_reloads_total",
+            "Reloads of the models while the server ran: with changes, without, or with models refused.",
+            ["result"],
+            registry=self.registry,
+        )
+        for result in ("changed", "unchanged", "refused"):
+            self.reloads.labels(result)
         self.benchmark = Gauge(
             "forecast_benchmark_displacement_error_meters",
             "Mean of forecast_displacement_error_meters in the benchmark.",
@@ -120,6 +128,8 @@ class Metrics:
             infos: all models; the versions of one name ascend.
             default: the default model.
         """
+        self.model_info.clear()
+        self.benchmark.clear()
         for info in infos:
             is_default = "true" if info == default else "false"
             self.model_info.labels(info.name, info.version, info.protocol.value, is_default).set(1)

@@ -13,6 +13,7 @@ from cab.forecast.v1.routes import (
     GET_SCENE_CONSISTENCY,
     LIST_MODEL_CONSISTENCY,
     LIST_MODELS,
+    RELOAD_MODELS,
     RESET_SCENE,
     Route,
 )
@@ -31,6 +32,7 @@ UNARY_METHODS: Mapping[Route[Any, Any], Callable[[DataPlane, Any], Awaitable[Mes
     GET_SCENE_CONSISTENCY: lambda dataplane, request: dataplane.consistency.get_scene(request),
     LIST_MODEL_CONSISTENCY: lambda dataplane, request: dataplane.consistency.list_models(request),
     RESET_SCENE: lambda dataplane, request: dataplane.consistency.reset_scene(request),
+    RELOAD_MODELS: lambda dataplane, request: dataplane.reload_models(request),
 }
 """Functions that execute the unary methods except Predict, whose requests are decoded off the event loop."""
 

@@ -64,7 +64,7 @@ class Served:
         self._runner.run(self._plane.close())
         self._runner.close()
 
-    def _load(self) -> Registry:
+    def _load(self, _: object) -> Registry:
         """Return the baselines and the model, which may be one of them."""
         alone = registry()
         return alone if self.info in alone.infos() else registry(self._forecaster)

@@ -25,7 +25,7 @@ def test_help_names_the_commands_and_loads_nothing_heavy() -> None:
     )
     run = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)  # noqa: S603
     text, _, loaded = run.stdout.partition("LOADED")
-    for command in ("serve", "predict", "consistency", "convert", "train", "evaluate", "benchmark"):
+    for command in ("serve", "predict", "reload", "consistency", "convert", "train", "evaluate", "benchmark"):
         assert command in text
     assert not {"torch", "numpy", "matplotlib", "grpc", "httpx", "fastapi", "model"} & set(loaded.split())
 

@@ -23,7 +23,7 @@ def server() -> Iterator[Server]:
     async def start() -> None:
         # Limits small enough for generated requests to reach
         limits = {"max_agents": 4, "max_states": 6, "max_raster_pixels": 3000, "default_model": "cab"}
-        box.append(Server(settings(**limits), load=registry))
+        box.append(Server(settings(**limits), load=lambda _: registry()))
         await box[0].start()
         started.set()
 

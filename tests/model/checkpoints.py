@@ -1,8 +1,13 @@
 """Checkpoints of small numbers for tests."""
 
+import json
+import shutil
+from pathlib import Path
+
 import torch
 from torch import Tensor
 
+import model
 from model.forecaster import ModelInfo, Protocol
 from model.networks.config import AnyNetworkConfig, NetworkConfig
 from model.networks.forecaster import CvaeNetworks
@@ -43,3 +48,20 @@ def tensors(config: NetworkConfig | None = None) -> dict[str, Tensor]:
         shapes = CvaeNetworks(config or network()).state_dict()
     generator = torch.Generator().manual_seed(0)
     return {name: 0.1 * torch.randn(shape.shape, generator=generator) for name, shape in shapes.items()}
+
+
+def copy_bundled(folder: Path, checkpoint: str = "cab", version: str | None = None) -> Path:
+    """Copy a bundled checkpoint, under another version if one is given.
+
+    Args:
+        folder: the new folder.
+        checkpoint: name of the bundled folder.
+        version: the version of the copy; None: the original's.
+    """
+    source = Path(next(iter(model.__path__))) / "checkpoints" / checkpoint
+    shutil.copytree(source, folder)
+    if version is not None:
+        config = json.loads((folder / "config.json").read_text())
+        config["info"]["version"] = version
+        (folder / "config.json").write_text(json.dumps(config))
+    return folder

@@ -32,7 +32,7 @@ def settings(**values: Any) -> Settings:
 async def running(*forecasters: Forecaster, **values: Any) -> AsyncIterator[Server]:
     """Run a server with the baselines and the forecasters, the first of which is the default."""
     default = {"default_model": forecasters[0].info.name} if forecasters else {}
-    server = Server(settings(**(default | values)), load=lambda: registry(*forecasters))
+    server = Server(settings(**(default | values)), load=lambda _: registry(*forecasters))
     await server.start()
     for forecaster in forecasters:
         if hasattr(forecaster, "forget"):

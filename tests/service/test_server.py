@@ -19,13 +19,11 @@ from structlog.testing import capture_logs
 
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab_forecast import AsyncClient, Client
-from model.checkpoint import save_checkpoint
-from model.forecaster import Protocol
 from model.registry import Registry
 from service.lifecycle import Phase
 from service.server import ServeError, Server, StartError
 from service.settings import Settings
-from tests.model.checkpoints import info, network, tensors
+from tests.model.checkpoints import copy_bundled
 from tests.service.fakes import FakeForecaster, registry
 from tests.service.processes import process, ready
 from tests.service.requests import make_request
@@ -65,15 +63,25 @@ async def test_a_missing_model() -> None:
 async def test_missing_and_broken_checkpoints(tmp_path: Path) -> None:
     with pytest.raises(StartError, match="no such folder"):
         await Server(settings(models=tmp_path / "nowhere")).start()
-    (tmp_path / "broken").mkdir()
-    with pytest.raises(StartError, match="broken"):
+    copy_bundled(tmp_path / "cab")
+    (tmp_path / "cab" / "model.safetensors").write_bytes(b"")
+    with pytest.raises(
+        StartError, match=r"cab is not loaded, and a checkpoint was refused: cab: .*safetensors"
+    ):
         await Server(settings(models=tmp_path)).start()
+    with pytest.raises(StartError, match=r"no model 'cab'.*refused: cab: .*safetensors"):
+        await Server(settings(models=tmp_path, default_model="cab")).start()
+    server = Server(settings(models=tmp_path, default_model="kalman", max_batch_agents=2))
+    with capture_logs() as logs:
+        await server.start()
+    await server.stop()
+    assert [entry["log_level"] for entry in logs if entry["event"] == "model refused"] == ["warning"]
 
 
 async def test_it_listens_before_it_is_ready() -> None:
     fake = FakeForecaster()
     fake.free.clear()
-    server = Server(settings(default_model="fake"), load=lambda: registry(fake))
+    server = Server(settings(default_model="fake"), load=lambda _: registry(fake))
     starting = asyncio.create_task(server.start())
     assert await asyncio.to_thread(fake.entered.wait, 10)  # warming up
     async with httpx.AsyncClient(base_url=f"http://{server.http_address}") as client:
@@ -134,7 +142,7 @@ async def test_a_forward_that_hangs_makes_the_server_not_ready(monkeypatch: pyte
 
 async def test_a_crash_of_the_batcher_ends_the_server(monkeypatch: pytest.MonkeyPatch) -> None:
     fake = FakeForecaster()
-    server = Server(settings(default_model="fake"), load=lambda: registry(fake))
+    server = Server(settings(default_model="fake"), load=lambda _: registry(fake))
     ready = threading.Event()
     serving = asyncio.create_task(server.run(lambda _: ready.set()))
     assert await asyncio.to_thread(ready.wait, 30)
@@ -356,22 +364,21 @@ async def test_stop_does_not_wait_for_ever() -> None:
 
 
 async def test_models_are_the_baselines_when_none_are_bundled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.server.bundled_models", lambda: None)
-    server_models = Server(Settings())._load()
+    monkeypatch.setattr("service.predict.models_folder.bundled_models", lambda: None)
+    server_models = Server(Settings())._load(None)
     assert isinstance(server_models, Registry)
     assert "kalman" in server_models
 
 
 def as_bundled(folder: Path) -> None:
-    """Checkpoints of random weights, as they come with the package: one name under both protocols."""
-    for version, protocol in (("1.0.0", Protocol.CAUSAL), ("1.0.0+paper", Protocol.PAPER)):
-        known = info(name="cab", version=version, protocol=protocol)
-        save_checkpoint(folder / version, known, network(), tensors(), "")
+    """Write checkpoints as they come with the package: one name under both protocols."""
+    copy_bundled(folder / "1.0.0", "cab", "1.0.0")
+    copy_bundled(folder / "1.0.0+paper", "cab-paper", "1.0.0+paper")
 
 
 async def test_the_bundled_cab_is_the_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     as_bundled(tmp_path)
-    monkeypatch.setattr("service.server.bundled_models", lambda: tmp_path)
+    monkeypatch.setattr("service.predict.models_folder.bundled_models", lambda: tmp_path)
     server = Server(settings(max_batch_agents=8))
     with capture_logs() as logs:
         await server.start()
@@ -416,7 +423,7 @@ async def test_a_folder_of_ones_own_warns_and_one_of_the_paper_protocol_alone_is
 ) -> None:
     as_bundled(tmp_path)
     with capture_logs() as logs:
-        assert Server(settings(models=tmp_path))._load().get("cab").info.version == "1.0.0"
+        assert Server(settings(models=tmp_path))._load(None).get("cab").info.version == "1.0.0"
     assert [entry["log_level"] for entry in logs if "skipped" in entry["event"]] == ["warning"]
     shutil.rmtree(tmp_path / "1.0.0")
     with pytest.raises(StartError, match=r"paper protocol, and there is no other .*--allow-paper-protocol"):

@@ -1,5 +1,6 @@
 """OpenAPI document: the contract as REST serves it."""
 
+from collections.abc import Callable
 from importlib import metadata
 from typing import Any
 
@@ -13,6 +14,7 @@ from cab.forecast.v1.routes import (
     LIST_MODEL_CONSISTENCY,
     LIST_MODELS,
     PREDICT,
+    RELOAD_MODELS,
     RESET_SCENE,
     ROUTES,
     WATCH_SCENE,
@@ -26,6 +28,8 @@ from service.errors import (
     NotAcceptable,
     NotFound,
     Overloaded,
+    PermissionDenied,
+    ReloadRefused,
     RequestTimeout,
     ServiceError,
     TooLarge,
@@ -61,6 +65,14 @@ _ERRORS: dict[Route[Any, Any], _Errors] = {
     LIST_MODEL_CONSISTENCY: (BadFields,),
     WATCH_SCENE: (BadFields, TrackingUnavailable),
     RESET_SCENE: (BadFields, TooLarge, UnsupportedMediaType, RequestTimeout, TrackingUnavailable),
+    RELOAD_MODELS: (
+        BadFields,
+        TooLarge,
+        UnsupportedMediaType,
+        RequestTimeout,
+        PermissionDenied,
+        ReloadRefused,
+    ),
 }
 """Further errors of each method."""
 _RETRYABLE = (Overloaded, Unavailable, TrackingUnavailable)
@@ -124,7 +136,7 @@ def _operation(route: Route[Any, Any], settings: Settings) -> Schema:
     if parameters:
         operation["parameters"] = parameters
     if route.verb == "POST":
-        examples = predict_examples() if route is PREDICT else reset_examples()
+        examples = _EXAMPLES[route]()
         json = {"schema": reference(route.request.DESCRIPTOR.name), "examples": examples}
         body = {Format.JSON.value: json, Format.PROTOBUF.value: _BINARY}
         operation["requestBody"] = {"required": True, "content": body}
@@ -286,6 +298,18 @@ def predict_examples() -> dict[str, dict[str, Any]]:
 def reset_examples() -> dict[str, dict[str, Any]]:
     """Return example requests of ResetScene by name."""
     return {"street": {"summary": "Forget a scene", "value": {"scene_id": EXAMPLE_IDS["scene_id"]}}}
+
+
+def reload_examples() -> dict[str, dict[str, Any]]:
+    """Return example requests of ReloadModels by name."""
+    return {"reload": {"summary": "Read the folder of models again", "value": {}}}
+
+
+_EXAMPLES: dict[Route[Any, Any], Callable[[], dict[str, dict[str, Any]]]] = {
+    PREDICT: predict_examples,
+    RESET_SCENE: reset_examples,
+    RELOAD_MODELS: reload_examples,
+}
 
 
 def _event_example() -> dict[str, str]:

@@ -34,7 +34,7 @@ async def opened(*forecasters: FakeForecaster, **values: Any) -> AsyncIterator[D
     """A data plane, the default of which is the first forecaster."""
     named = {"default_model": forecasters[0].info.name} if forecasters else {}
     plane = DataPlane(settings(**(named | values)), Metrics())
-    await plane.open(lambda: registry(*forecasters))
+    await plane.open(lambda _: registry(*forecasters))
     for forecaster in forecasters:
         forecaster.forget()
     try:
@@ -118,7 +118,7 @@ async def test_merging_changes_nothing_that_is_remembered_or_counted() -> None:
     for merge in (False, True):
         metrics = Metrics()
         plane = DataPlane(settings(default_model="fake"), metrics)
-        await plane.open(lambda: registry(FakeForecaster()))
+        await plane.open(lambda _: registry(FakeForecaster()))
         for tick in range(16):
             request = pb.PredictRequest(time=NOW + 0.5 * tick, scene_id="s")
             request.options.consistency, request.options.merge = True, merge
@@ -488,7 +488,7 @@ async def test_fallback_must_reach_as_far() -> None:
 async def test_warm_up_meets_every_shape_of_the_default_model() -> None:
     fake, other = FakeForecaster(), FakeForecaster("other", supports_blind=False)
     plane = DataPlane(settings(default_model="fake", max_batch_agents=6), Metrics())
-    await plane.open(lambda: registry(fake, other))
+    await plane.open(lambda _: registry(fake, other))
     await plane.close()
     limits = [agents for kind, agents, context, _ in fake.batches if context is Context.BLIND]
     assert limits == [1, 2, 4, 6] * 2  # vehicles and pedestrians
@@ -558,7 +558,7 @@ async def test_phases() -> None:
     assert plane.phase is Phase.STARTING
     with pytest.raises(Unavailable, match="starting"):
         await plane.predict(make_request(1))
-    await plane.open(lambda: registry(fake))
+    await plane.open(lambda _: registry(fake))
     fake.forget()
     fake.free.clear()
     call = asyncio.create_task(plane.predict(make_request(1)))

@@ -11,6 +11,7 @@ from urllib.parse import quote, urlencode
 
 from google.protobuf.message import Message
 
+from cab.forecast.v1.admin_service_pb2 import ReloadModelsRequest, ReloadModelsResponse
 from cab.forecast.v1.consistency_service_pb2 import (
     GetAgentConsistencyRequest,
     GetAgentConsistencyResponse,
@@ -37,7 +38,8 @@ Response = TypeVar("Response", bound=Message)
 PREDICTION_SERVICE = "cab.forecast.v1.PredictionService"
 MODEL_SERVICE = "cab.forecast.v1.ModelService"
 CONSISTENCY_SERVICE = "cab.forecast.v1.ConsistencyService"
-SERVICES = (PREDICTION_SERVICE, MODEL_SERVICE, CONSISTENCY_SERVICE)
+ADMIN_SERVICE = "cab.forecast.v1.AdminService"
+SERVICES = (PREDICTION_SERVICE, MODEL_SERVICE, CONSISTENCY_SERVICE, ADMIN_SERVICE)
 """Full names of all gRPC services of the contract."""
 
 _PATH_PARAMETER = re.compile(r"\{(\w+)\}")
@@ -128,6 +130,14 @@ RESET_SCENE: Route[ResetSceneRequest, ResetSceneResponse] = Route(
     ResetSceneRequest,
     ResetSceneResponse,
 )
+RELOAD_MODELS: Route[ReloadModelsRequest, ReloadModelsResponse] = Route(
+    ADMIN_SERVICE,
+    "ReloadModels",
+    "POST",
+    "/v1/admin/reload-models",
+    ReloadModelsRequest,
+    ReloadModelsResponse,
+)
 
 ROUTES: tuple[Route[Any, Any], ...] = (
     PREDICT,
@@ -138,5 +148,6 @@ ROUTES: tuple[Route[Any, Any], ...] = (
     LIST_MODEL_CONSISTENCY,
     WATCH_SCENE,
     RESET_SCENE,
+    RELOAD_MODELS,
 )
 """All methods of the contract."""
