@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from cli import benchmark, consistency, convert, evaluate, predict, reload, serve, train
+from cli import benchmark, consistency, convert, doctor, evaluate, predict, reload, serve, train
 
 app = typer.Typer(
     name="cab-forecast",
@@ -31,6 +31,7 @@ def _options(
 
 
 serve.register(app)
+doctor.register(app)
 predict.register(app)
 reload.register(app)
 consistency.register(app)

@@ -3,9 +3,10 @@
 import asyncio
 import gc
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from cli.failures import fail
 
@@ -16,7 +17,27 @@ if TYPE_CHECKING:
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
-    app.command("serve")(serve)
+    app.command("serve", cls=_ServeCommand)(serve)
+
+
+class _ServeCommand(TyperCommand):
+    """Command whose help lists all settings, not only those that have flags."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Print the help, then the settings."""
+        from rich.console import Console  # noqa: PLC0415
+        from rich.table import Table  # noqa: PLC0415
+        from rich.text import Text  # noqa: PLC0415
+
+        from service.settings_reference import settings_reference  # noqa: PLC0415 (slow to import)
+
+        super().format_help(ctx, formatter)
+        settings = Table("Variable", "Default", "Meaning", title="All settings", box=None, pad_edge=False)
+        for setting in settings_reference():
+            allowed = f" Allowed: {setting.allowed}." if setting.allowed else ""
+            meaning = setting.meaning.replace("``", "") + allowed
+            settings.add_row(setting.variable, Text(setting.default or "not set"), Text(meaning))
+        Console().print(settings)
 
 
 def serve(

@@ -4,21 +4,16 @@ A page marks each generated part with ``<!-- generated: NAME -->`` and ``<!-- en
 between the two is written from the code or the data file; the rest of the page is written by hand.
 """
 
-import ast
-import inspect
 import json
 import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
-import annotated_types
 import typer
-from pydantic.fields import FieldInfo
 
 from cli.main import app
-from service.environment import PREFIX
-from service.settings import Settings
+from service.settings_reference import settings_reference
 
 DOCS = Path(__file__).resolve().parent
 BENCHMARK = DOCS / "data/benchmark_train_val.json"
@@ -55,35 +50,20 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 def settings_table() -> str:
     """Return one row for each setting: variable, flag of ``serve``, default, range and meaning."""
-    meanings = attribute_docstrings(Settings)
     flags = serve_flags()
     return table(
         ["Variable", "Flag of `serve`", "Default", "Allowed", "Meaning"],
         [
             [
-                f"`{PREFIX}{name.upper()}`",
-                f"`{flags[name]}`" if name in flags else "",
-                _default(field),
-                _allowed(field),
-                meanings[name],
+                f"`{setting.variable}`",
+                f"`{flags[setting.name]}`" if setting.name in flags else "",
+                "not set" if setting.default is None else f"`{setting.default}`",
+                setting.allowed if _is_bound(setting.allowed) else _quoted(setting.allowed),
+                _markdown(setting.meaning),
             ]
-            for name, field in Settings.model_fields.items()
+            for setting in settings_reference()
         ],
     )
-
-
-def attribute_docstrings(cls: type) -> dict[str, str]:
-    """Return the docstring of each annotated attribute of a class, on one line and as Markdown."""
-    [definition] = ast.parse(inspect.getsource(cls)).body
-    assert isinstance(definition, ast.ClassDef)  # noqa: S101 - the source of a class is a class
-    found = {}
-    for before, after in zip(definition.body, definition.body[1:], strict=False):
-        if isinstance(before, ast.AnnAssign) and isinstance(before.target, ast.Name):
-            match after:
-                case ast.Expr(value=ast.Constant(value=str(text))):
-                    line = " ".join(text.split()).replace("``", "`").replace("|", "\\|")
-                    found[before.target.id] = re.sub(r"\bNone: ", "not set: ", line)
-    return found
 
 
 def serve_flags() -> dict[str, str]:
@@ -204,30 +184,16 @@ def main() -> None:
         (DOCS / page).write_text(render(page), encoding="utf-8")
 
 
-def _default(field: FieldInfo) -> str:
-    match field.get_default():
-        case None | ():
-            return "not set"
-        case bool() as switch:
-            return f"`{str(switch).lower()}`"
-        case float() as number:
-            return f"`{number:.15g}`"
-        case value:
-            return f"`{value}`"
+def _is_bound(allowed: str) -> bool:
+    return allowed.startswith((">", "≥"))
 
 
-def _allowed(field: FieldInfo) -> str:
-    bounds = []
-    for limit in field.metadata:
-        match limit:
-            case annotated_types.Gt(gt=bound):
-                bounds.append(f"> {bound:.15g}")
-            case annotated_types.Ge(ge=bound):
-                bounds.append(f"≥ {bound:.15g}")
-    if bounds:
-        return ", ".join(bounds)
-    choices = [choice for choice in get_args(field.annotation) if isinstance(choice, str)]
-    return ", ".join(f"`{choice}`" for choice in choices)
+def _quoted(choices: str) -> str:
+    return ", ".join(f"`{choice}`" for choice in choices.split(", ") if choice)
+
+
+def _markdown(meaning: str) -> str:
+    return meaning.replace("``", "`").replace("|", "\\|")
 
 
 def _line(cells: Sequence[str]) -> str:

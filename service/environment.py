@@ -29,9 +29,19 @@ def unknown_variable(environment: Mapping[str, str], settings: Collection[str]) 
         if not upper.startswith(PREFIX) or upper in known:
             continue
         if not _is_service_link(upper.removeprefix(PREFIX), value):
-            [nearest] = difflib.get_close_matches(upper, sorted(known), n=1, cutoff=0.0)
-            return f"{name}: there is no such setting; the nearest is {nearest}"
+            return f"{name}: {no_such_setting(upper, known)}"
     return None
+
+
+def no_such_setting(name: str, known: Collection[str]) -> str:
+    """Return an error text for a name that is no setting, with the nearest one.
+
+    Args:
+        name: the name.
+        known: the names of the settings, at least one.
+    """
+    [nearest] = difflib.get_close_matches(name, sorted(known), n=1, cutoff=0.0)
+    return f"there is no such setting; the nearest is {nearest}"
 
 
 def _is_service_link(name: str, value: str) -> bool:

@@ -2,7 +2,7 @@
 
 import ipaddress
 import os
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -17,7 +17,7 @@ from pydantic_settings import (
     TomlConfigSettingsSource,
 )
 
-from service.environment import CONFIG, PREFIX, unknown_variable
+from service.environment import CONFIG, PREFIX, no_such_setting, unknown_variable
 from service.redis_url import parse_address
 
 FALLBACK_MODEL = "constant-velocity-yaw"
@@ -229,7 +229,9 @@ def load(config: Path | None = None, **flags: Any) -> Settings:
     try:
         settings = FromFile(**given)
     except ValidationError as error:
-        raise SettingsError("; ".join(_describe(problem) for problem in error.errors())) from None
+        raise SettingsError(
+            "; ".join(_describe(problem, given, file) for problem in error.errors())
+        ) from None
     except ValueError as error:  # the file is no valid TOML
         raise SettingsError(f"{file}: {error}") from None
     return settings
@@ -251,9 +253,27 @@ def _strip_token(token: object) -> object:
     return stripped
 
 
-def _describe(problem: ErrorDetails) -> str:
+def _describe(problem: ErrorDetails, flags: Collection[str], file: Path | None) -> str:
+    """Return a problem with the place of the value: a flag, a variable or the file.
+
+    Args:
+        problem: the problem.
+        flags: the settings that flags give, which go before variables.
+        file: the TOML file, the last source; None: there is none.
+    """
     place = ".".join(map(str, problem["loc"])) or "settings"
-    return f"{place}: {problem['msg'].removeprefix('Value error, ')}"
+    text = f"{place}: {problem['msg'].removeprefix('Value error, ')}"
+    if not problem["loc"]:
+        return text
+    name = str(problem["loc"][0])
+    if problem["type"] == "extra_forbidden":
+        text = f"{name}: {no_such_setting(name, Settings.model_fields)}"
+    variables = {variable.upper() for variable in os.environ}
+    if name in flags:
+        return text
+    if PREFIX + name.upper() in variables:
+        return f"{text} (in the variable {PREFIX}{name.upper()})"
+    return text if file is None else f"{file}: {text}"
 
 
 def split_address(address: str) -> tuple[str, int]:

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+from structlog.testing import capture_logs
 from typer.testing import CliRunner
 
 from cli.main import app
@@ -14,7 +15,10 @@ SMALL = "trajectron-no-context"
 
 def test_it_tells_what_took_over_and_fails_if_one_was_refused(tmp_path: Path) -> None:
     copy_bundled(tmp_path / "one", SMALL)
-    with in_thread(settings(models=tmp_path, default_model=SMALL, max_batch_agents=2)) as server:
+    with (
+        capture_logs(),
+        in_thread(settings(models=tmp_path, default_model=SMALL, max_batch_agents=2)) as server,
+    ):
         to = ["--endpoint", server.grpc_address]
         copy_bundled(tmp_path / "two", SMALL, "2.1.0")
         result = CliRunner().invoke(app, ["reload", *to])

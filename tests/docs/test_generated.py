@@ -4,6 +4,7 @@ import pytest
 
 from docs import generate
 from service.settings import Settings
+from service.settings_reference import attribute_docstrings
 
 
 @pytest.mark.parametrize("page", generate.PAGES)
@@ -14,9 +15,7 @@ def test_a_page_is_up_to_date(page: str) -> None:
 
 @pytest.mark.parametrize("name", Settings.model_fields)
 def test_every_setting_is_explained(name: str) -> None:
-    assert generate.attribute_docstrings(Settings).get(name), (
-        f"service.settings.Settings.{name} has no docstring"
-    )
+    assert attribute_docstrings(Settings).get(name), f"service.settings.Settings.{name} has no docstring"
 
 
 def test_a_page_without_its_marker_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

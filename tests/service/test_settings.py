@@ -100,11 +100,40 @@ def test_bad_files(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match="no such configuration file"):
         load(tmp_path / "missing.toml")
     (tmp_path / "typo.toml").write_text('htpp = "127.0.0.1:1"\n')
-    with pytest.raises(SettingsError, match="htpp"):
+    with pytest.raises(SettingsError) as caught:
         load(tmp_path / "typo.toml")
+    assert str(caught.value) == f"{tmp_path}/typo.toml: htpp: there is no such setting; the nearest is http"
     (tmp_path / "broken.toml").write_text("http = \n")
     with pytest.raises(SettingsError, match=r"broken\.toml"):
         load(tmp_path / "broken.toml")
+
+
+def test_errors_name_the_place_of_the_value(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "server.toml"
+    file.write_text("max_agents = 0\n[serve]\nhttp = 1\n")
+    with pytest.raises(SettingsError) as caught:
+        load(file)
+    agents, table = str(caught.value).split("; ", 1)
+    assert agents == f"{file}: max_agents: Input should be greater than or equal to 1"
+    assert table.startswith(f"{file}: serve: there is no such setting")
+    file.write_text("max_agents = 7\n")
+    monkeypatch.setenv("FORECAST_MAX_AGENTS", "many")
+    with pytest.raises(SettingsError, match=r"^max_agents: .* \(in the variable FORECAST_MAX_AGENTS\)$"):
+        load(file)
+    with pytest.raises(SettingsError, match=r"^max_agents: [^(]*$"):
+        load(file, max_agents=0)
+
+
+def test_default_models_of_callers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FORECAST_DEFAULT_MODELS", "truck = cab@2.1.0, lab=kalman,")
+    assert load().default_models == {"truck": "cab@2.1.0", "lab": "kalman"}
+    monkeypatch.setenv("FORECAST_DEFAULT_MODELS", "truck")
+    with pytest.raises(SettingsError, match='default_models: "truck" is not key-name=model'):
+        load()
+    monkeypatch.delenv("FORECAST_DEFAULT_MODELS")
+    file = tmp_path / "server.toml"
+    file.write_text('[default_models]\ntruck = "cab"\n')
+    assert load(file).default_models == {"truck": "cab"}
 
 
 def test_addresses() -> None:

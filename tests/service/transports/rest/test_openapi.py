@@ -7,6 +7,7 @@ import pytest
 from google.protobuf import json_format
 from pydantic import SecretStr
 
+from cab.forecast.v1 import admin_service_pb2 as admin_pb
 from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
@@ -18,7 +19,7 @@ from service.transports.rest.schemas import REQUIRED, bounds, comments, parse_co
 from tests.service.fakes import FakeForecaster
 from tests.service.servers import running
 
-FILES = (pb.DESCRIPTOR, models_pb.DESCRIPTOR, consistency_pb.DESCRIPTOR)
+FILES = (pb.DESCRIPTOR, models_pb.DESCRIPTOR, consistency_pb.DESCRIPTOR, admin_pb.DESCRIPTOR)
 DOCUMENT = openapi_document(Settings())
 SCHEMAS: dict[str, Any] = DOCUMENT["components"]["schemas"]
 
