@@ -15,6 +15,13 @@ from model.scenes.scene import STEP_SECONDS, Raster
 from service.predict.catalog import reference
 from service.predict.plan import Group, Plan
 from service.predict.request import Options
+from service.predict.wire import packed_doubles, packed_tag
+
+_WEIGHTS, _MEANS, _COVARIANCES, _SAMPLES = (
+    packed_tag(pb.AgentForecast.DESCRIPTOR, name) for name in ("weights", "means", "covariances", "samples")
+)
+_TRIANGLE = ((0, 0), (0, 1), (1, 1))
+"""Elements of a covariance that are sent."""
 
 
 def encode(plan: Plan, seed: int) -> pb.PredictResponse:
@@ -95,8 +102,8 @@ def _fill(
     agents, modes = mixture.log_weights.shape
     counts: Ints = np.full(agents, modes)
     mode_ids: Ints = np.broadcast_to(np.arange(modes), (agents, modes))
+    samples: Floats = np.zeros((agents, 0))
     with torch.inference_mode():
-        samples: Floats = np.zeros((agents, 0))
         if options.samples:
             seeds = [agent_seed(seed, forecast.agent_id) for forecast in forecasts]
             samples = mixture.sample(options.samples, seeds).numpy().reshape(agents, -1)
@@ -104,9 +111,8 @@ def _fill(
             merged = merge_modes(mixture)
             mixture, counts, mode_ids = merged.mixture, merged.counts.numpy(), merged.mode_ids.numpy()
             modes = mode_ids.shape[1]
-        weights: Floats = mixture.log_weights.double().softmax(dim=1).numpy()
-        means: Floats = mixture.world_means.numpy()
-        covariances: Floats = mixture.covariances.double().numpy()
+    weights = _softmax(mixture.log_weights.numpy().astype(np.float64))
+    means, covariances = mixture.means.numpy(), mixture.covariances.numpy()
     remaining = np.zeros(agents)
     if 0 < options.max_modes < modes:
         heaviest = np.argsort(-weights, axis=1, kind="stable")[:, : options.max_modes]
@@ -120,14 +126,25 @@ def _fill(
             mode_ids[rows, places],
         )
         remaining = np.clip(1.0 - weights.sum(axis=1), 0.0, 1.0)
-    triangles = covariances[..., [0, 0, 1], [0, 1, 1]]
-    for row, forecast in enumerate(forecasts):
-        # Lists, because protobuf takes a list of floats several times faster than an array
-        count = int(counts[row])  # merged agents have padding behind
-        forecast.mode_ids.extend(mode_ids[row, :count].tolist())
-        forecast.weights.extend(weights[row, :count].tolist())
-        forecast.remaining_weight = float(remaining[row])
-        forecast.most_likely_mode = int(weights[row, :count].argmax())
-        forecast.means.extend(means[row, :count].ravel().tolist())
-        forecast.covariances.extend(triangles[row, :count].ravel().tolist())
-        forecast.samples.extend(samples[row].tolist())
+    positions: Floats = means + mixture.origin.numpy()[:, None, None]
+    triangles: Floats = np.empty((*covariances.shape[:-2], 3))
+    for place, (row, column) in enumerate(_TRIANGLE):
+        triangles[..., place] = covariances[..., row, column]
+    best, left, numbers = weights.argmax(axis=1).tolist(), remaining.tolist(), mode_ids.tolist()
+    for row, (forecast, count) in enumerate(zip(forecasts, counts.tolist(), strict=True)):
+        # Merged agents have padding behind their modes
+        forecast.mode_ids.extend(numbers[row][:count])
+        forecast.remaining_weight = left[row]
+        forecast.most_likely_mode = best[row]
+        forecast.MergeFromString(
+            packed_doubles(_WEIGHTS, weights[row, :count])
+            + packed_doubles(_MEANS, positions[row, :count])
+            + packed_doubles(_COVARIANCES, triangles[row, :count])
+            + packed_doubles(_SAMPLES, samples[row])
+        )
+
+
+def _softmax(log_weights: Floats) -> Floats:
+    weights: Floats = np.exp(log_weights - log_weights.max(axis=1, keepdims=True))
+    weights /= weights.sum(axis=1, keepdims=True)
+    return weights

@@ -212,14 +212,11 @@ def frames_of(forecaster: Forecaster, catalog: Catalog) -> int:
 
 def finite(mixture: TrajectoryMixture) -> Bools:
     """Return which agents' forecasts are finite, and so can be sent: [N]."""
-    weights = mixture.log_weights.double().exp()
-    parts = [
-        torch.isfinite(weights).all(dim=1) & (weights.sum(dim=1) > 0),
-        torch.isfinite(mixture.means).flatten(1).all(dim=1),
-        torch.isfinite(mixture.covariances).flatten(1).all(dim=1),
-        torch.isfinite(mixture.origin).all(dim=1),
-    ]
-    mask: Bools = torch.stack(parts).all(dim=0).numpy()
+    with np.errstate(over="ignore"):
+        weights = np.exp(mixture.log_weights.numpy().astype(np.float64))
+    mask: Bools = np.isfinite(weights).all(axis=1) & (weights.sum(axis=1) > 0)
+    for values in (mixture.means, mixture.covariances, mixture.origin):
+        mask &= np.isfinite(values.numpy()).all(axis=tuple(range(1, values.ndim)))
     return mask
 
 
