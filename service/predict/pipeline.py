@@ -4,10 +4,10 @@ import asyncio
 import secrets
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import structlog
 
@@ -40,8 +40,21 @@ _RESERVE = 0.005
 """Seconds before the deadline from which on a call does not wait for the track memory."""
 
 
+_LIGHT_AGENTS = 32
+_LIGHT_BYTES = 2**14
+"""Bytes of a light request without its map: some 250 states."""
+_LIGHT_MAP_BYTES = 2**17
+"""Bytes of its map, which must not be a PNG."""
+
+
+class _Work(Protocol):
+    """Way to run a function for a call, and to wait for its result."""
+
+    def __call__(self, call: Call, function: Callable[..., _T], *arguments: object) -> Awaitable[_T]: ...
+
+
 class Pipeline:
-    """Stages of a Predict call. Used on one event loop; what takes milliseconds runs in threads."""
+    """Stages of a Predict call. Used on one event loop; what may take milliseconds runs in threads."""
 
     catalog: Catalog
     """Models that calls begin with; set before the lifecycle becomes ready, and by reloads."""
@@ -108,18 +121,19 @@ class Pipeline:
                 options = read_options(message, forecaster.info, self._settings)
                 agents: Agents | None = None
                 recalled: TrackingResult | None = None
+                work = self._at_once if _is_light(message, options) else self._in_thread
                 with self._batcher.hold_places(call, options.predicted):
                     # Recall
                     if options.recalls:
                         agents, recalled = await self._recall(message, options, forecaster, catalog, call)
                     # Plan
-                    plan = await self._in_thread(
+                    plan = await work(
                         call, make_plan, message, options, forecaster, catalog, self._settings, agents
                     )
                     # Batch
-                    await self._forecast(plan, call)
+                    await self._forecast(plan, call, work)
                 # Encode and remember; the track memory usually responds while the response is being encoded
-                encoding = self._in_thread(call, self._encode, plan, _seed(options))
+                encoding = work(call, self._encode, plan, _seed(options))
                 if not options.scene_id:
                     response = await encoding
                 else:
@@ -150,12 +164,12 @@ class Pipeline:
         )
         return with_histories(agents, own, tracked.histories), tracked
 
-    async def _forecast(self, plan: Plan, call: Call) -> None:
+    async def _forecast(self, plan: Plan, call: Call, work: "_Work") -> None:
         """Run the plan's forwards, and forwards of the fallback for forecasts that are not finite."""
         groups = list(plan.groups)
         while True:
             outcomes = await self._batcher.run([group.job for group in groups], call)
-            broken = await self._in_thread(call, set_outcomes, groups, outcomes)
+            broken = await work(call, set_outcomes, groups, outcomes)
             if not broken:
                 break
             _log.error("forecasts not finite", model=plan.forecaster.info.name, agents=len(broken))
@@ -190,17 +204,32 @@ class Pipeline:
             for warning in forecast.warnings:
                 self._metrics.input_warnings.labels(code_name(warning.code)).inc()
 
+    async def _at_once(self, call: Call, function: Callable[..., _T], *arguments: object) -> _T:
+        """Run a function on the event loop, and count its time as the call's."""
+        return _timed(call, function, *arguments)
+
     async def _in_thread(self, call: Call, function: Callable[..., _T], *arguments: object) -> _T:
         """Run a function in a helper thread, and count its time as the call's."""
+        loop = asyncio.get_running_loop()
+        return await loop.run_in_executor(self._threads, _timed, call, function, *arguments)
 
-        def timed() -> _T:
-            started = time.perf_counter()
-            try:
-                return function(*arguments)
-            finally:
-                call.helper_seconds += time.perf_counter() - started
 
-        return await asyncio.get_running_loop().run_in_executor(self._threads, timed)
+def _timed(call: Call, function: Callable[..., _T], *arguments: object) -> _T:
+    started = time.perf_counter()
+    try:
+        return function(*arguments)
+    finally:
+        call.helper_seconds += time.perf_counter() - started
+
+
+def _is_light(request: pb.PredictRequest, options: Options) -> bool:
+    """Return whether each part of the work for a call takes about as long as the handover to a thread."""
+    if options.samples or options.merge or options.predicted > _LIGHT_AGENTS:
+        return False
+    image = request.scene_raster.image
+    map_bytes = len(image.packed_bits)
+    rest = request.ByteSize() - map_bytes
+    return not image.png and map_bytes <= _LIGHT_MAP_BYTES and rest <= _LIGHT_BYTES
 
 
 def _seed(options: Options) -> int:
