@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from model.arrays import Ints
+from model.arrays import Bools, Floats, Ints
 from model.baselines.unimodal import step_times, unimodal
 from model.forecaster import Context, Features, Forecaster, ModelInfo, Protocol
+from model.geometry import known_or_zero
 from model.mixture import TrajectoryMixture
 from model.scenes.scene import STEP_SECONDS, AgentType, Scene
 
@@ -35,16 +35,16 @@ class Noise:
     standing_density: float | None = None
     """m²/s³, ``acceleration_density`` of an agent below ``_STANDING_SPEED``; None: as of a moving one."""
 
-    def density(self, speed: Tensor) -> Tensor:
+    def density(self, speed: Floats) -> Floats:
         """Return the power spectral density, linear between standing and moving: [N], m²/s³.
 
         Args:
             speed: [N], m/s, maximum over the history.
         """
-        moving = torch.full_like(speed, self.acceleration_density)
+        moving = np.full_like(speed, self.acceleration_density)
         if self.standing_density is None:
             return moving
-        share = ((speed - _STANDING_SPEED) / (_MOVING_SPEED - _STANDING_SPEED)).clamp(0, 1)
+        share = ((speed - _STANDING_SPEED) / (_MOVING_SPEED - _STANDING_SPEED)).clip(0, 1)
         return self.standing_density + share * (moving - self.standing_density)
 
 
@@ -108,12 +108,12 @@ class Kalman(Forecaster):
         origin = states.position[targets, -1]
         # Always five frames, even if the scene has fewer, so that agents of many scenes can be joined
         positions = np.zeros((len(targets), HISTORY_FRAMES, 2))
-        positions[:, missing:] = np.nan_to_num(states.position[targets] - origin[:, None])
+        positions[:, missing:] = known_or_zero(states.position[targets] - origin[:, None])
         return {
             "origin": torch.from_numpy(origin),
             "positions": torch.from_numpy(positions),
             "first": torch.from_numpy(states.first[targets].astype(np.int64) + missing),
-            "velocity": torch.from_numpy(np.nan_to_num(states.velocity[targets, -1])),
+            "velocity": torch.from_numpy(known_or_zero(states.velocity[targets, -1])),
         }
 
     def forecast(
@@ -129,13 +129,15 @@ class Kalman(Forecaster):
             ValueError: steps outside 1 … 12.
         """
         noise = NOISE[agent_type]
-        time = step_times(self.info, steps).to(features["origin"].device)
-        density = noise.density(_top_speed(features["positions"], features["first"], features["velocity"]))
-        state = _filter(features["positions"], features["first"], features["velocity"], noise, density)
+        time: Floats = step_times(self.info, steps).numpy()
+        # In numpy, whose overhead for each of these many small operations is a fraction of torch's
+        positions, first, velocity = (features[name].numpy() for name in ("positions", "first", "velocity"))
+        density = noise.density(_top_speed(positions, first, velocity))
+        state = _filter(positions, first, velocity, noise, density)
         mean = state.position[:, None] + time[:, None] * state.velocity[:, None]
-        variance = _predict(state, time, density).var_position  # [N, T]
-        covariance = torch.diag_embed(variance[..., None].expand(-1, -1, 2))
-        return unimodal(mean, covariance, features["origin"])
+        covariance = np.zeros((*mean.shape, 2))
+        covariance[..., 0, 0] = covariance[..., 1, 1] = _predict(state, time, density).var_position
+        return unimodal(torch.from_numpy(mean), torch.from_numpy(covariance), features["origin"])
 
 
 def baselines() -> Sequence[Forecaster]:
@@ -147,8 +149,8 @@ def baselines() -> Sequence[Forecaster]:
 class _State:
     """Filtered states of N agents."""
 
-    position: Tensor  # [N, 2]
-    velocity: Tensor  # [N, 2]
+    position: Floats  # [N, 2]
+    velocity: Floats  # [N, 2]
     covariance: "_Covariance"
 
 
@@ -156,12 +158,12 @@ class _State:
 class _Covariance:
     """Covariances of (position, velocity) along one axis, each [N] or [N, T]."""
 
-    var_position: Tensor
-    both: Tensor
-    var_velocity: Tensor
+    var_position: Floats
+    both: Floats
+    var_velocity: Floats
 
 
-def _predict(state: _State, time: Tensor, density: Tensor) -> _Covariance:
+def _predict(state: _State, time: Floats, density: Floats) -> _Covariance:
     """Return the covariance at later times [T], s: [N, T].
 
     It is a sum of positive semi-definite terms, so that it is positive semi-definite, too.
@@ -176,7 +178,7 @@ def _predict(state: _State, time: Tensor, density: Tensor) -> _Covariance:
     )
 
 
-def _top_speed(positions: Tensor, first: Tensor, velocity: Tensor) -> Tensor:
+def _top_speed(positions: Floats, first: Ints, velocity: Floats) -> Floats:
     """Return the maximum speed since the first observed frame: [N], m/s.
 
     So an agent that has just stopped does not count as standing yet.
@@ -186,12 +188,14 @@ def _top_speed(positions: Tensor, first: Tensor, velocity: Tensor) -> Tensor:
         first: [N], first observed frame.
         velocity: [N, 2], m/s, now.
     """
-    between = positions.diff(dim=1).norm(dim=-1) / STEP_SECONDS
-    observed = torch.arange(between.shape[1], device=first.device) >= first[:, None]
-    return torch.maximum(torch.where(observed, between, 0.0).amax(dim=1), velocity.norm(dim=-1))
+    moved = positions[:, 1:] - positions[:, :-1]
+    between = np.hypot(moved[..., 0], moved[..., 1]) / STEP_SECONDS
+    observed = np.arange(between.shape[1]) >= first[:, None]
+    top: Floats = np.where(observed, between, 0.0).max(axis=1)
+    return np.maximum(top, np.hypot(velocity[:, 0], velocity[:, 1]))
 
 
-def _filter(positions: Tensor, first: Tensor, velocity: Tensor, noise: Noise, density: Tensor) -> _State:
+def _filter(positions: Floats, first: Ints, velocity: Floats, noise: Noise, density: Floats) -> _State:
     """Run the filter over the frames, from the first observed one on.
 
     Args:
@@ -211,17 +215,17 @@ def _filter(positions: Tensor, first: Tensor, velocity: Tensor, noise: Noise, de
     return state
 
 
-def _seen_once(position: Tensor, velocity: Tensor, noise: Noise) -> _State:
+def _seen_once(position: Floats, velocity: Floats, noise: Noise) -> _State:
     """Return the state of an agent with one position and a given velocity."""
-    one = torch.ones_like(position[:, 0])
+    one = np.ones_like(position[:, 0])
     return _State(
         position, velocity, _Covariance(one * noise.measurement**2, 0 * one, one * noise.given_velocity**2)
     )
 
 
-def _seen_twice(before: Tensor, now: Tensor, noise: Noise, density: Tensor) -> _State:
+def _seen_twice(before: Floats, now: Floats, noise: Noise, density: Floats) -> _State:
     """Return the state from two positions (the filter's limit for an unknown first velocity)."""
-    one = torch.ones_like(now[:, 0])
+    one = np.ones_like(now[:, 0])
     measured = noise.measurement**2
     velocity = 2 * measured / STEP_SECONDS**2 + density * STEP_SECONDS / 3
     return _State(
@@ -231,10 +235,9 @@ def _seen_twice(before: Tensor, now: Tensor, noise: Noise, density: Tensor) -> _
     )
 
 
-def _update(state: _State, measured: Tensor, noise: Noise, density: Tensor) -> _State:
+def _update(state: _State, measured: Floats, noise: Noise, density: Floats) -> _State:
     """Advance by one frame: prediction, then correction by the measured position [N, 2]."""
-    step = torch.full((1,), STEP_SECONDS, dtype=measured.dtype, device=measured.device)
-    ahead = _predict(state, step, density)
+    ahead = _predict(state, np.array([STEP_SECONDS]), density)
     position, both, velocity = ahead.var_position[:, 0], ahead.both[:, 0], ahead.var_velocity[:, 0]
     expected = state.position + STEP_SECONDS * state.velocity
     surprise = measured - expected
@@ -247,20 +250,20 @@ def _update(state: _State, measured: Tensor, noise: Noise, density: Tensor) -> _
         _Covariance(
             gain_position * noise.measurement**2,
             gain_velocity * noise.measurement**2,
-            (velocity - gain_velocity * both).clamp_min(0),
+            np.maximum(velocity - gain_velocity * both, 0.0),
         ),
     )
 
 
-def _choose(mask: Tensor, one: _State, other: _State) -> _State:
+def _choose(mask: Bools, one: _State, other: _State) -> _State:
     """Return one state where the mask [N] is set, else the other."""
     a, b = one.covariance, other.covariance
     return _State(
-        torch.where(mask[:, None], one.position, other.position),
-        torch.where(mask[:, None], one.velocity, other.velocity),
+        np.where(mask[:, None], one.position, other.position),
+        np.where(mask[:, None], one.velocity, other.velocity),
         _Covariance(
-            torch.where(mask, a.var_position, b.var_position),
-            torch.where(mask, a.both, b.both),
-            torch.where(mask, a.var_velocity, b.var_velocity),
+            np.where(mask, a.var_position, b.var_position),
+            np.where(mask, a.both, b.both),
+            np.where(mask, a.var_velocity, b.var_velocity),
         ),
     )

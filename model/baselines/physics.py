@@ -9,7 +9,6 @@ the devkit drives it forwards.
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,6 +17,7 @@ from model.baselines import uncertainty
 from model.baselines.uncertainty import SpreadBySpeed, aligned_covariance
 from model.baselines.unimodal import step_times, unimodal
 from model.forecaster import Context, Features, Forecaster, ModelInfo, Protocol
+from model.geometry import known_or_zero
 from model.mixture import TrajectoryMixture
 from model.scenes.scene import AgentType, Scene
 
@@ -83,10 +83,10 @@ class Physics(Forecaster):
         states.require_observed(targets)
         return {
             "position": torch.from_numpy(states.position[targets, -1]),
-            "velocity": torch.from_numpy(np.nan_to_num(states.velocity[targets, -1])),
-            "acceleration": torch.from_numpy(np.nan_to_num(states.acceleration[targets, -1])),
+            "velocity": torch.from_numpy(known_or_zero(states.velocity[targets, -1])),
+            "acceleration": torch.from_numpy(known_or_zero(states.acceleration[targets, -1])),
             "heading": torch.from_numpy(states.heading[targets, -1]),
-            "heading_rate": torch.from_numpy(np.nan_to_num(states.heading_rate[targets, -1])),
+            "heading_rate": torch.from_numpy(known_or_zero(states.heading_rate[targets, -1])),
         }
 
     def forecast(

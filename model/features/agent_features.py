@@ -6,7 +6,7 @@ import torch
 from model.arrays import Bools, Float32s, Floats, Ints
 from model.features.spec import FeatureSpec
 from model.forecaster import Context, Features, Prepared, complete
-from model.geometry import nearest_rows, rotate, wrap_angle
+from model.geometry import known_or_zero, nearest_rows, rotate, wrap_angle
 from model.scenes.raster import FAR, NEAR, MapView, map_view
 from model.scenes.scene import AgentStates, AgentType, Scene
 
@@ -78,7 +78,7 @@ def _histories(states: AgentStates, targets: Ints) -> Floats:
         wrap_angle(states.heading[targets] - heading)[..., None],
         states.heading_rate[targets][..., None],
     ]
-    histories: Floats = np.nan_to_num(np.concatenate(parts, axis=-1) / HISTORY_SCALE, nan=0.0)
+    histories: Floats = known_or_zero(np.concatenate(parts, axis=-1) / HISTORY_SCALE)
     return histories
 
 
@@ -95,7 +95,7 @@ def _neighbors(scene: Scene, targets: Ints, types: tuple[AgentType, ...]) -> Flo
         seen: Bools = (distance <= NEIGHBOR_REACH_M) & (targets[:, None] != others[None])
 
     def in_own_frame(vectors: Floats) -> Floats:
-        return rotate(np.nan_to_num(vectors[others, -1])[None], -own)
+        return rotate(known_or_zero(vectors[others, -1])[None], -own)
 
     heading = states.heading[others, -1][None] - own
     known = np.isfinite(heading)

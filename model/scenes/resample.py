@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from model.arrays import Bools, Floats, Ints
-from model.geometry import wrap_angle
+from model.geometry import known_or_zero, wrap_angle
 from model.scenes.observations import Observations
 from model.scenes.scene import STEP_SECONDS, AgentStates
 from model.scenes.state_fit import MIN_HEADING_SPEED, FittedStates, fit_states
@@ -184,7 +184,7 @@ def _interpolate(obs: Observations, grid: Floats) -> _GridSamples:
     there = exact | between | extrapolated
 
     # The unbroken run that ends now; any gap too wide to interpolate over contains a grid time
-    run = np.flip(np.logical_and.accumulate(np.flip(there, axis=1), axis=1), axis=1)
+    run = np.logical_and.accumulate(there[:, ::-1], axis=1)[:, ::-1]
     first = grid.shape[1] - run.sum(axis=1)
 
     weight = np.where(between, (grid - t_left) / np.where(between, t_right - t_left, 1.0), 0.0)
@@ -200,7 +200,7 @@ def _interpolate(obs: Observations, grid: Floats) -> _GridSamples:
     a, b = obs.heading[rows, left], obs.heading[rows, right]
     heading = wrap_angle(a + weight * wrap_angle(b - a))  # along the shorter arc
     heading[~run] = np.nan
-    first_time = np.take_along_axis(grid, np.minimum(first, grid.shape[1] - 1)[:, None], axis=1)[:, 0]
+    first_time = grid[rows[:, 0], np.minimum(first, grid.shape[1] - 1)]
     return _GridSamples(
         position=interpolate(obs.position),
         velocity=interpolate(obs.velocity),
@@ -246,7 +246,7 @@ def _derive(s: _GridSamples) -> AgentStates:
 
     moved = _backward_difference(s.position)
     moved[is_first] = s.first_velocity[s.first < frames]
-    moved = np.nan_to_num(_fill_first_from_next(moved, is_first))
+    moved = known_or_zero(_fill_first_from_next(moved, is_first))
     velocity_given = np.isfinite(s.velocity[..., 0])  # both components are given, or neither
     velocity = np.where(velocity_given[..., None], s.velocity, moved)
     first_given = _fill_first_from_next(s.velocity, is_first)
@@ -256,7 +256,7 @@ def _derive(s: _GridSamples) -> AgentStates:
 
     change = _consistent_difference(s.velocity, moved, velocity_given)
     change[is_first] = 0.0
-    acceleration = np.where(np.isfinite(s.acceleration), s.acceleration, np.nan_to_num(change))
+    acceleration = np.where(np.isfinite(s.acceleration), s.acceleration, known_or_zero(change))
 
     heading_given = np.isfinite(s.heading)
     direction = _fill_unknown(_direction(moved), observed)
@@ -265,7 +265,7 @@ def _derive(s: _GridSamples) -> AgentStates:
     turned = _consistent_difference(s.heading, direction, heading_given, wrap_angle)
     turned[is_first] = np.nan
     heading_rate = np.where(np.isfinite(s.heading_rate), s.heading_rate, turned)
-    heading_rate = np.nan_to_num(_fill_first_from_next(heading_rate, is_first))
+    heading_rate = known_or_zero(_fill_first_from_next(heading_rate, is_first))
 
     for values in (velocity, acceleration, heading, heading_rate):
         values[~observed] = np.nan
@@ -329,7 +329,7 @@ def _last_velocity_known(obs: Observations) -> Bools:
         gap_after = np.diff(obs.time, axis=1, append=np.inf)
     index = np.arange(obs.time.shape[1])[None, :]
     fits = (gap_after <= MAX_GAP + _ROUNDING) | (index >= last[:, None])
-    connected = np.flip(np.logical_and.accumulate(np.flip(fits, axis=1), axis=1), axis=1)
+    connected = np.logical_and.accumulate(fits[:, ::-1], axis=1)[:, ::-1]
     early = obs.time <= _newest_time(obs)[:, None] - MIN_DIFFERENCE_SPAN + _ROUNDING
     known: Bools = given | (connected & early & (index < last[:, None])).any(axis=1)
     return known
@@ -384,7 +384,7 @@ def _reverse_if_backing(direction: Floats, given: Floats) -> Floats:
     """
     apart = np.abs(wrap_angle(given - direction))
     known = np.isfinite(apart)
-    newest = apart.shape[1] - 1 - np.flip(known, axis=1).argmax(axis=1)
+    newest = apart.shape[1] - 1 - known[:, ::-1].argmax(axis=1)
     backwards = known.any(axis=1) & (apart[np.arange(len(apart)), newest] > np.pi / 2)
     return np.where(backwards[:, None], wrap_angle(direction + np.pi), direction)
 
@@ -394,7 +394,7 @@ def _fill_unknown(values: Floats, observed: Bools) -> Floats:
     frames = np.arange(values.shape[1])[None, :]
     known = np.isfinite(values) & observed
     before = np.maximum.accumulate(np.where(known, frames, -1), axis=1)
-    after = np.flip(np.minimum.accumulate(np.flip(np.where(known, frames, values.shape[1]), 1), axis=1), 1)
+    after = np.minimum.accumulate(np.where(known, frames, values.shape[1])[:, ::-1], axis=1)[:, ::-1]
     source = np.where(before >= 0, before, np.minimum(after, values.shape[1] - 1))
-    filled: Floats = np.take_along_axis(values, source, axis=1)
+    filled: Floats = values[np.arange(len(values))[:, None], source]
     return filled

@@ -1,5 +1,6 @@
 """Plan of a call: the forecaster of each agent, the forwards that follow, and what came of them."""
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -261,7 +262,7 @@ def _assign(
     draft = Draft(index, agent_id, pb.FORECAST_STATUS_OK, row=row, forecaster=forecaster)
     draft.history_frames = min(observed, forecaster.info.history_frames)
     kind = scene.types[row]
-    heading_known = bool(np.isfinite(scene.states.heading[row, -1]))
+    heading_known = math.isfinite(scene.states.heading[row, -1])
     reason = _unfit(forecaster, kind, heading_known)
     if reason is not None:
         if _unfit(fallback, kind, heading_known) is not None:

@@ -56,7 +56,8 @@ _BYTES_PER_POINT = 16  # of a sample: x and y as double
 _PAIRS = [(_VX, _VY), (_AX, _AY)]
 _BOUNDS = np.array([FIELD_BOUNDS[f"AgentState.{name}"][1] for name in _FIELDS])  # of the absolute value
 _FIXED64 = 1  # wire type
-_TAG_BYTES = np.array([field.number << 3 | _FIXED64 for field in pb.AgentState.DESCRIPTOR.fields])
+_IS_TAG = np.zeros(256, dtype=np.bool_)
+_IS_TAG[[field.number << 3 | _FIXED64 for field in pb.AgentState.DESCRIPTOR.fields]] = True
 _DOUBLE_BYTES = 9  # tag and value
 if len(_FIELDS) != _RATE + 1 or any(
     field.type != FieldDescriptor.TYPE_DOUBLE or field.number != index + 1
@@ -325,7 +326,7 @@ def _state_values(states: Sequence[pb.AgentState]) -> tuple[Floats, Bools]:
     pairs = np.frombuffer(b"".join(encoded), dtype=np.uint8).reshape(-1, _DOUBLE_BYTES)
     columns = pairs[:, 0].astype(np.int64) >> 3
     columns -= 1
-    if not np.isin(pairs[:, 0], _TAG_BYTES).all():
+    if not _IS_TAG[pairs[:, 0]].all():
         return _state_values(_without_unknown_fields(states))
     rows = np.repeat(np.arange(len(states)), lengths // _DOUBLE_BYTES)
     values[rows, columns] = np.ascontiguousarray(pairs[:, 1:]).view("<f8")[:, 0]
@@ -419,6 +420,8 @@ class _StateTable:
         Args:
             rows: ascending row indices: [R].
         """
+        if not rows.size:
+            return []
         owners, firsts = np.unique(self._owner[rows], return_index=True)
         unknown = [int(agent) not in self.faults for agent in self._agents[owners]]
         first_rows: list[int] = rows[firsts[np.array(unknown, dtype=np.bool_)]].tolist()

@@ -5,6 +5,8 @@ format, a packed field of doubles is a tag, a length and the doubles' bytes, whi
 message merges them as one copy.
 """
 
+import functools
+
 from google.protobuf.descriptor import Descriptor, FieldDescriptor
 
 from model.arrays import Floats
@@ -21,8 +23,12 @@ def packed_doubles(tag: bytes, values: Floats) -> bytes:
     """
     if not values.size:
         return b""
-    content = values.astype("<f8", copy=False).tobytes()
-    return tag + varint(len(content)) + content
+    return _header(tag, 8 * values.size) + values.astype("<f8", copy=False).tobytes()
+
+
+@functools.lru_cache(maxsize=1024)
+def _header(tag: bytes, size: int) -> bytes:
+    return tag + varint(size)
 
 
 def packed_tag(message: Descriptor, name: str) -> bytes:
