@@ -18,7 +18,7 @@ FORECAST = pb.AgentForecast.DESCRIPTOR
     st.dictionaries(st.sampled_from(["weights", "means", "covariances", "samples"]), arrays("f8", _SHAPES))
 )
 def test_fields_from_bytes_are_those_from_numbers(fields: dict[str, Floats]) -> None:
-    slow, fast = pb.AgentForecast(agent_id="a", status=1), pb.AgentForecast(agent_id="a", status=1)
+    slow, fast = pb.AgentForecast(agent_id="a"), pb.AgentForecast(agent_id="a")
     for name, values in fields.items():
         getattr(slow, name).extend(values.ravel().tolist())
         fast.MergeFromString(packed_doubles(packed_tag(FORECAST, name), values))
@@ -26,7 +26,7 @@ def test_fields_from_bytes_are_those_from_numbers(fields: dict[str, Floats]) -> 
 
 
 def test_the_elements_of_a_part_of_an_array_are_in_its_order() -> None:
-    values = np.arange(60, dtype=np.float32).reshape(5, 3, 4)[::2, :, 1:3]
+    values = np.arange(60.0).reshape(5, 3, 4)[::2, :, 1:3]
     encoded = packed_doubles(packed_tag(FORECAST, "means"), values)
     assert list(pb.AgentForecast.FromString(encoded).means) == values.ravel().tolist()
 
