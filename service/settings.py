@@ -65,8 +65,12 @@ class Settings(BaseSettings):
     default_models: Annotated[dict[str, str], NoDecode] = Field(default_factory=dict)
     """Default models of some callers by the name of their API key, ``key-name=model,…`` in the environment;
     all others have ``default_model``."""
+    shadow: str | None = None
+    """``name@version:share``: a second model that forecasts a share of the scenes (0 to 1), and of the calls
+    without a scene, once they are answered and while the model is free. Its consistency, errors and counts
+    are in the metrics under ``name@version``; responses hold nothing of it."""
     reload_seconds: float | None = Field(default=None, ge=0.1)
-    """Seconds between looks at the folder of models: what has changed there is loaded. None: it is read again
+    """Seconds between looks at the folder of models, of which every change is loaded; None: it is read again
     only on SIGHUP and by ReloadModels."""
     allow_paper_protocol: bool = False
     """Flag for loading models trained by the paper protocol, which warn in every response. Otherwise they are
@@ -149,6 +153,13 @@ class Settings(BaseSettings):
             return tokens
         if isinstance(value, Sequence):
             return tuple(_strip_token(token) for token in value)
+        return value
+
+    @field_validator("shadow")
+    @classmethod
+    def _is_shadow(cls, value: str | None) -> str | None:
+        if value is not None:
+            split_shadow(value)
         return value
 
     @field_validator("default_models", mode="before")
@@ -286,6 +297,22 @@ def split_address(address: str) -> tuple[str, int]:
     if not colon or not host or not port.isdecimal() or int(port) > 65535:
         raise ValueError(f'"{address}" is not HOST:PORT')
     return host.removeprefix("[").removesuffix("]"), int(port)
+
+
+def split_shadow(shadow: str) -> tuple[str, float]:
+    """Return model and share of ``name@version:share``.
+
+    Raises:
+        ValueError: it has another form, or the share is not above 0 and at most 1.
+    """
+    model, _, share = shadow.rpartition(":")
+    try:
+        number = float(share)
+    except ValueError:
+        number = 0.0
+    if not model or not 0 < number <= 1:
+        raise ValueError(f'"{shadow}" is not name@version:share with a share above 0 and up to 1')
+    return model, number
 
 
 def is_local(settings: Settings) -> bool:

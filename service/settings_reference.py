@@ -56,8 +56,8 @@ def attribute_docstrings(cls: type) -> dict[str, str]:
 
 
 def _default(field: FieldInfo) -> str | None:
-    match field.get_default():
-        case None | ():
+    match field.get_default(call_default_factory=True):
+        case None | () | dict():
             return None
         case bool() as switch:
             return str(switch).lower()

@@ -13,7 +13,7 @@ import time
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import asynccontextmanager, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NoReturn, TypeVar
 
 import structlog
@@ -40,6 +40,10 @@ _USABLE = 0.8
 be wrong by the rest."""
 
 
+_SPARE_SECONDS = 0.01
+"""Seconds that a forward outside the queue may be expected to take."""
+
+
 class Call:
     """A call that was admitted: its deadline, and the queue places that it holds until its batches start."""
 
@@ -58,6 +62,8 @@ class Call:
         """Number of queue places held."""
         self.caller: str | None = None
         """Name of the caller's key; None: there is none."""
+        self.when_sent: Callable[[], None] | None = None
+        """Function to call once the response has been sent; None: there is none."""
 
     def remaining(self) -> float:
         """Return the seconds until the deadline; negative after it."""
@@ -298,13 +304,33 @@ class Batcher:
         except BaseException:
             self._withdraw(entries)
             raise
-        return [_combine([entry.done.result() for entry in part]) for part in parts]
+        return [combine([entry.done.result() for entry in part]) for part in parts]
 
     async def run_in_model_thread(self, job: Job) -> float:
         """Run a job past the queue, for warm-up, and learn how long it takes: the seconds that it returns."""
         _, seconds = await self.call_in_model_thread(_forward, job, [job.inputs], job.steps, self._cutters)
         self._costs.measure(job.key, job.agents, seconds)
         return seconds
+
+    @property
+    def is_free(self) -> bool:
+        """True if no call waits for the model or is in it."""
+        return not (self._running or self._waiting or self._queue)
+
+    def spare_parts(self, job: Job) -> list[Job]:
+        """Return a job in parts so small that calls which arrive meanwhile hardly wait, for ``run_spare``."""
+        size = job.agents
+        while size > 1 and self._costs.seconds(job.key, size) > _SPARE_SECONDS:
+            size //= 2
+        return [replace(job, inputs=job.inputs[start : start + size]) for start in range(0, job.agents, size)]
+
+    async def run_spare(self, job: Job) -> Outcome:
+        """Run a job past the queue. The caller waits until ``is_free``, and counts the work."""
+        mixture, seconds = await self.call_in_model_thread(
+            _forward, job, [job.inputs], job.steps, self._cutters
+        )
+        self._costs.measure(job.key, job.agents, seconds, usual=False)
+        return Outcome(mixture, 0.0, seconds, job.agents)
 
     def forget(self, forecasters: Iterable[Forecaster]) -> None:
         """Forget how long the forwards of models take that are gone."""
@@ -532,7 +558,7 @@ def _cut(mixture: TrajectoryMixture, steps: int) -> TrajectoryMixture:
     )
 
 
-def _combine(outcomes: Sequence[Outcome]) -> Outcome:
+def combine(outcomes: Sequence[Outcome]) -> Outcome:
     """Return the outcome of a job from those of its parts."""
     if len(outcomes) == 1:
         return outcomes[0]

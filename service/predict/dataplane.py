@@ -14,8 +14,9 @@ from service.predict.batcher import Batcher
 from service.predict.catalog import Catalog, reference
 from service.predict.pipeline import Pipeline
 from service.predict.reload import Load, Reloader
+from service.predict.shadow import Shadow
 from service.predict.torch_threads import set_helper_threads
-from service.settings import Settings, is_local
+from service.settings import Settings, is_local, split_shadow
 from service.telemetry.metrics import Metrics
 from service.tracking.collector import ConsistencyCollector, StoreMetrics
 from service.tracking.model_references import ModelReferences
@@ -46,6 +47,7 @@ class DataPlane:
             initializer=set_helper_threads,
         )
         self._store = make_store(settings)
+        self._shadow_guard: Guard | None = None
         store_metrics = StoreMetrics(metrics.registry)
         self._guard = Guard(store_metrics.observe, store_metrics.failed)
         # A guard of their own, so that slow consistency calls do not open the circuit of the forecasts
@@ -53,7 +55,9 @@ class DataPlane:
         tracker = Tracker(
             self._store, self._guard, self._asking, settings.store_budget_ms / 1000, self._references
         )
-        metrics.registry.register(ConsistencyCollector(tracker.aggregates))
+        shadow_tracker = self._make_shadow_tracker(store_metrics)
+        shadow_aggregates = None if shadow_tracker is None else shadow_tracker.aggregates
+        metrics.registry.register(ConsistencyCollector(tracker.aggregates, shadow_aggregates))
         self.consistency = ConsistencyService(
             self._store,
             self._asking,
@@ -65,6 +69,9 @@ class DataPlane:
         )
         """Calls of the consistency service."""
         self._pipeline = Pipeline(settings, metrics, self._lifecycle, self._batcher, tracker, self._threads)
+        if settings.shadow is not None and shadow_tracker is not None:
+            name, share = split_shadow(settings.shadow)
+            self._pipeline.shadow = Shadow(name, share, settings, metrics, self._batcher, shadow_tracker)
         self._reloader: Reloader | None = None
         self._reloads: set[asyncio.Task[admin_pb.ReloadModelsResponse]] = set()
         self._following: asyncio.Task[None] | None = None
@@ -142,9 +149,24 @@ class DataPlane:
         reloading.add_done_callback(self._reloads.discard)
         return await asyncio.shield(reloading)
 
+    def _make_shadow_tracker(self, store_metrics: StoreMetrics) -> Tracker | None:
+        """Return the tracker of the shadow model, with a guard of its own; None if there is no such model."""
+        if self._settings.shadow is None:
+            return None
+        self._shadow_guard = Guard(store_metrics.observe, store_metrics.failed)
+        return Tracker(
+            self._store,
+            self._shadow_guard,
+            self._asking,
+            self._settings.store_budget_ms / 1000,
+            self._references,
+        )
+
     def _take_over(self, catalog: Catalog) -> None:
         self._references.set_loaded(reference(info) for info in catalog.models.infos())
         self._pipeline.catalog = catalog
+        if self._pipeline.shadow is not None:
+            self._pipeline.shadow.set_catalog(catalog)
 
     def refuse(self) -> None:
         """Accept no more calls; those in progress go on, except streams of consistency events."""
@@ -175,8 +197,12 @@ class DataPlane:
         await asyncio.gather(*tasks, return_exceptions=True)
         if self._reloader is not None:
             self._reloader.close()
+        if self._pipeline.shadow is not None:
+            await self._pipeline.shadow.close()
         await self._batcher.stop()
         await self._guard.close()
+        if self._shadow_guard is not None:
+            await self._shadow_guard.close()
         await self._asking.close()
         await self._store.close()
         await asyncio.to_thread(self._threads.shutdown, cancel_futures=True)

@@ -1,6 +1,7 @@
 """One Predict call from top to bottom: decode, validate, recall, plan, batch, encode, remember."""
 
 import asyncio
+import functools
 import secrets
 import time
 from collections import Counter
@@ -22,6 +23,7 @@ from service.predict.input_warnings import code_name, code_names
 from service.predict.plan import Plan, frames_of, make_plan, set_outcomes
 from service.predict.request import Agents, Options, read_agents, read_options
 from service.predict.request_reader import EncodedRequest, RequestReader
+from service.predict.shadow import Shadow
 from service.predict.track_updates import (
     forecast_updates,
     observation_updates,
@@ -75,6 +77,8 @@ class Pipeline:
         self._tracker = tracker
         self._threads = threads
         self._reader = RequestReader(threads)
+        self.shadow: Shadow | None = None
+        """Second model that forecasts a share of the calls; None: there is none."""
         metrics.begin_input_warnings(code_names())
 
     @contextmanager
@@ -94,6 +98,8 @@ class Pipeline:
         call = self._batcher.admit(asyncio.get_running_loop().time() + seconds)
         with self._lifecycle.in_progress():
             yield call
+        if call.when_sent is not None:
+            call.when_sent()
 
     async def predict(
         self, request: pb.PredictRequest | EncodedRequest, call: Call | None = None
@@ -141,6 +147,8 @@ class Pipeline:
                     report(response, recalled, stored)
         self._count_agents(plan)
         self._count_warnings(response)
+        if self.shadow is not None:
+            call.when_sent = functools.partial(self.shadow.offer, message, plan, catalog)
         return response
 
     async def _recall(

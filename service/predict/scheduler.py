@@ -83,13 +83,21 @@ class CostModel:
         within = max(agents if size == largest else min(agents, 2**size - 1) for size, agents in fitting)
         return min(max_agents, max(within, MIN_BATCH_AGENTS))
 
-    def measure(self, key: Hashable, agents: int, seconds: float) -> None:
-        """Learn from a forward."""
+    def measure(self, key: Hashable, agents: int, seconds: float, usual: bool = True) -> None:
+        """Learn from a forward.
+
+        Args:
+            key: what can share it.
+            agents: number of agents.
+            seconds: its duration.
+            usual: whether the next calls may be expected to need such a forward.
+        """
         rate = agents / max(seconds, 1e-6)
         known = self._rates.setdefault(key, {})
         size = agents.bit_length()
         known[size] = known.get(size, rate) + _SMOOTHING * (rate - known.get(size, rate))
-        self._last_key = key
+        if usual:
+            self._last_key = key
 
     def forget(self, models: Container[Hashable]) -> None:
         """Forget some models, the first part of their keys."""

@@ -63,7 +63,7 @@ class Metrics:
         )
         self.agents = Counter(
             "forecast_agents_total",
-            "Agents of answered calls, by requested model and forecast status.",
+            "Agents of answered calls, by requested model and status; the shadow's under name@version.",
             ["model", "status"],
             registry=self.registry,
         )
@@ -104,6 +104,12 @@ class Metrics:
             "forecast_model_info",
             "1 for each loaded model.",
             ["name", "version", "protocol", "default"],
+            registry=self.registry,
+        )
+        self.shadow_calls = Counter(
+            "forecast_shadow_calls_total",
+            "Calls for the shadow model: done, dropped because models were busy, or failed.",
+            ["model", "result"],
             registry=self.registry,
         )
         self.reloads = Counter(

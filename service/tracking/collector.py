@@ -57,13 +57,15 @@ class ConsistencyCollector(Collector):
 
     Args:
         aggregates: aggregates of the settled sets.
+        shadow: those of the shadow model; None: there is none.
     """
 
-    def __init__(self, aggregates: Aggregates) -> None:
+    def __init__(self, aggregates: Aggregates, shadow: Aggregates | None = None) -> None:
         self._aggregates = aggregates
+        self._shadow = shadow
 
     def collect(self) -> Iterable[Metric]:
-        """Return the metrics by model name; the versions of a model are added up."""
+        """Return the metrics by model name; the versions of a model are added up, except the shadow's."""
         dispersion = HistogramMetricFamily(
             "forecast_dispersion_meters",
             "Standard deviation of the distances of all ages' forecasts for an instant to their barycentre.",
@@ -82,6 +84,8 @@ class ConsistencyCollector(Collector):
         by_name: dict[str, list[ModelAggregate]] = {}
         for model, aggregate in self._aggregates.models.items():
             by_name.setdefault(model.partition("@")[0], []).append(aggregate)
+        if self._shadow is not None:
+            by_name |= {model: [aggregate] for model, aggregate in self._shadow.models.items()}
         for name, versions in sorted(by_name.items()):
             _add(dispersion, [name], versions, DISPERSIONS[0], _METERS)
             for range_m, metric in zip(RANGES_M, CONVERGENCES, strict=True):

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from pydantic import SecretStr
 
-from service.settings import SettingsError, load, split_address
+from service.settings import SettingsError, load, split_address, split_shadow
 
 
 @pytest.fixture(autouse=True)
@@ -134,6 +134,14 @@ def test_default_models_of_callers(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     file = tmp_path / "server.toml"
     file.write_text('[default_models]\ntruck = "cab"\n')
     assert load(file).default_models == {"truck": "cab"}
+
+
+def test_shadow() -> None:
+    assert load(shadow="cab@3.0.0:0.1").shadow == "cab@3.0.0:0.1"
+    assert split_shadow("cab@3.0.0:0.1") == ("cab@3.0.0", 0.1)
+    for wrong in ("", "cab", "cab:", ":0.5", "cab:0", "cab:1.1", "cab:nan", "cab:half"):
+        with pytest.raises(SettingsError, match=r"shadow: .* is not name@version:share"):
+            load(shadow=wrong)
 
 
 def test_addresses() -> None:
