@@ -170,6 +170,7 @@ def predict_request(
     strict: bool = False,
     history: History = "request",
     consistency: bool = False,
+    priority: int = 0,
     blind: bool | None = None,
 ) -> PredictRequest:
     """Build a request for one scene at one time.
@@ -192,6 +193,7 @@ def predict_request(
         history: source of earlier observations: ``request``, or ``memory``: the server's tracks as well, so
             that the request only needs new observations. ``memory`` needs a scene_id.
         consistency: whether to return the latest consistency of each agent. Needs a scene_id.
+        priority: 0 to 7; under overload calls of a higher priority are forecast first and refused last.
         blind: alias: True is ``context="blind"``, False ``context="full"``.
 
     Raises:
@@ -223,6 +225,7 @@ def predict_request(
             # Left out if it is the default, for servers that do not know the field.
             history=HISTORY_SOURCE_MEMORY if history == "memory" else HISTORY_SOURCE_UNSPECIFIED,
             consistency=consistency,
+            priority=priority,
         ),
     )
 

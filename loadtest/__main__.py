@@ -71,6 +71,7 @@ def main(
     ] = None,
     uploads: Annotated[int, typer.Option(help="slow uploads")] = 300,
     half_headers: Annotated[int, typer.Option(help="connections that never end their headers")] = 1000,
+    readers: Annotated[int, typer.Option(help="clients that never read their responses")] = 100,
     out: Annotated[Path | None, typer.Option(help="folder for report.md and report.html")] = None,
 ) -> None:
     """Run scenarios one after the other, and print the report."""
@@ -96,6 +97,7 @@ def main(
         http=http,
         uploads=uploads,
         half_headers=half_headers,
+        readers=readers,
         settings=dict(one.split("=", 1) for one in setting or ()),
     )
     report = asyncio.run(run(names, options))

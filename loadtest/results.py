@@ -48,6 +48,10 @@ class Observer:
         self.http = http
         self._pid = pid
 
+    def resident(self) -> float:
+        """Return the bytes of the process now; NaN if it runs elsewhere."""
+        return float(psutil.Process(self._pid).memory_info().rss) if self._pid is not None else math.nan
+
     def usage(self) -> Usage:
         """Return the usage now."""
         text = httpx.get(f"http://{self.http}/metrics", timeout=30, trust_env=False).text
@@ -83,6 +87,8 @@ class Result:
     after: Usage
     peak: float = 0.0
     """Calls/s of the closed loop, in the same run; 0: not measured."""
+    resident: list[float] = field(default_factory=list)
+    """Bytes of the server again and again during the run."""
     checked: int = 0
     """Number of answers that were compared with the forward."""
     wrong: list[str] = field(default_factory=list)

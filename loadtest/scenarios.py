@@ -3,13 +3,18 @@
 import asyncio
 import math
 import resource
+import subprocess
+import sys
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
-from contextlib import asynccontextmanager, suppress
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
+from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import replace
+
+import numpy as np
 
 from cab.forecast.v1.routes import PREDICT
 from loadtest.generator import Calls, Load
+from loadtest.requests import Encoding, encode
 from loadtest.results import Result
 from loadtest.session import CLIENTS, Session
 from loadtest.wire import read_head
@@ -25,6 +30,7 @@ USUAL_DEADLINE = 1.0
 
 _UPLOAD_BYTES = 15_000_000
 _UPLOAD_PIECE = 2**16
+_MEBIBYTE = 2**20
 _PIECE_SECONDS = 1.0
 """Seconds between the pieces of an upload."""
 _PROBE_PERIOD = 0.2
@@ -91,19 +97,48 @@ async def spike(session: Session) -> None:
 async def overload(session: Session) -> None:
     """Offer three times the peak, with a short deadline, a long one and none.
 
-    The peak is measured again after each run; the mean of the one before and the one after counts.
+    The peak is that of the deadline, and measured again after each run; the mean of the two counts.
     """
     options = session.options
-    peak = await session.peak()
-    rate = options.rate or OVERLOAD * peak
     for deadline in DEADLINES if options.deadline is None else (options.deadline,):
+        peak = await session.peak(deadline)
+        rate = options.rate or OVERLOAD * peak
         load = Load(session.arrivals(rate, options.seconds), options.seconds, deadline)
         text = "no deadline" if deadline is None else f"deadline {1000 * deadline:g} ms"
         result = await session.open_loop(f"overload, {text}", load, peak)
+        result.notes.append(_memory(result))
         await session.recover(result)
-        after = await session.peak()
-        result.peak = (peak + after) / 2
-        peak = after
+        result.peak = (peak + await session.peak(deadline)) / 2
+
+
+async def neighbour(session: Session) -> None:
+    """Call with one client, first alone and then beside a process that takes one core."""
+    seconds = session.options.seconds / 2
+    quiet = await session.measure("quiet", session.generator.closed_loop(1, seconds))
+    with _busy_core():
+        busy = await session.measure("busy neighbour", session.generator.closed_loop(1, seconds))
+    slowdown = busy.latency(0.5) / quiet.latency(0.5)
+    busy.notes.append(f"p50 {slowdown:.2f} × the quiet one")
+    if slowdown > session.options.max_slowdown:
+        busy.problems.append(f"p50 is more than {session.options.max_slowdown:g} × the quiet one")
+
+
+async def slow_readers(session: Session) -> None:
+    """Call while many clients send requests over REST and never read the responses."""
+    options, peak = session.options, await session.peak()
+    load = Load(
+        session.arrivals(options.rate or 0.4 * peak, options.seconds), options.seconds, _deadline(session)
+    )
+    body = encode(session.requests[0].message, Encoding.PROTOBUF)
+    tasks = [asyncio.create_task(_never_read(session.http, body)) for _ in range(options.readers)]
+    try:
+        result = await session.open_loop("slow readers", load, peak)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+    result.notes.append(f"{options.readers} clients that do not read; {_memory(result)}")
+    await session.recover(result)
 
 
 async def cancelled(session: Session) -> None:
@@ -182,6 +217,8 @@ SCENARIOS: Mapping[str, Scenario] = {
     "overload": overload,
     "cancelled": cancelled,
     "slow-uploads": slow_uploads,
+    "slow-readers": slow_readers,
+    "neighbour": neighbour,
     "restart": restart,
     "soak": soak,
 }
@@ -190,6 +227,20 @@ SCENARIOS: Mapping[str, Scenario] = {
 
 def _deadline(session: Session) -> float:
     return session.options.deadline or USUAL_DEADLINE
+
+
+def _memory(result: Result) -> str:
+    """Return how much memory the server had in the second and the last third of the run, and at most."""
+    third = len(result.resident) // 3
+    if not third:
+        return "memory: not observed"
+    middle, last = (
+        float(np.mean(part)) for part in (result.resident[third:-third], result.resident[-third:])
+    )
+    return (
+        f"memory at most {max(result.resident) / _MEBIBYTE:.0f} MiB; "
+        f"from the second to the last third {100 * (last / middle - 1):+.1f} %"
+    )
 
 
 async def _constant(session: Session, name: str, share: float) -> Result:
@@ -218,6 +269,31 @@ async def _upload(http: str) -> None:
         await asyncio.sleep(_PIECE_SECONDS)
 
 
+async def _never_read(http: str, body: bytes) -> None:
+    """Send requests on one connection, as fast as the server takes them, and read nothing."""
+    head = f"POST {PREDICT.path} HTTP/1.1\r\nHost: {http}\r\nContent-Type: application/x-protobuf\r\n"
+    message = f"{head}Content-Length: {len(body)}\r\n\r\n".encode() + body
+    while True:
+        with suppress(OSError):
+            async with _connection(http, limit=1) as (_, writer):
+                while True:
+                    writer.write(message)
+                    await writer.drain()
+                    await asyncio.sleep(_PIECE_SECONDS)
+        await asyncio.sleep(_PIECE_SECONDS)
+
+
+@contextmanager
+def _busy_core() -> Iterator[None]:
+    """Keep one core busy by another process during a block."""
+    process = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+    try:
+        yield
+    finally:
+        process.kill()
+        process.wait()
+
+
 async def _half_header(http: str) -> None:
     """Send the beginning of a request, again when the server closes the connection."""
     while True:
@@ -242,9 +318,17 @@ async def _probe(http: str, seconds: list[float]) -> None:
 
 
 @asynccontextmanager
-async def _connection(http: str) -> AsyncIterator[tuple[asyncio.StreamReader, asyncio.StreamWriter]]:
+async def _connection(
+    http: str, limit: int = 2**16
+) -> AsyncIterator[tuple[asyncio.StreamReader, asyncio.StreamWriter]]:
+    """Open a connection for the time of a block.
+
+    Args:
+        http: HOST:PORT.
+        limit: bytes beyond which the reader stops to receive.
+    """
     host, _, port = http.rpartition(":")
-    reader, writer = await asyncio.open_connection(host, int(port))
+    reader, writer = await asyncio.open_connection(host, int(port), limit=limit)
     try:
         yield reader, writer
     finally:

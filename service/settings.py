@@ -115,6 +115,9 @@ class Settings(BaseSettings):
     """Seconds in which the headers of a REST request, or the handshake of a gRPC connection, must arrive."""
     body_timeout: float = Field(default=10.0, gt=0)
     """Seconds in which the body of a request must arrive."""
+    write_timeout: float = Field(default=10.0, gt=0)
+    """Seconds in which a client must go on reading its response. Then REST closes the connection, and a gRPC
+    call stops to count as one in progress."""
     drain_seconds: float = Field(default=10.0, ge=0)
     """Seconds that accepted calls get to finish when the server stops."""
     threads: int | None = Field(default=None, ge=1)

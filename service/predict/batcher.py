@@ -1,20 +1,17 @@
 """Dynamic batching: calls that wait for the model at the same time share a forward.
 
 A batch starts as soon as the model is free and never waits for more calls: under light load a call runs
-alone, under heavy load batches grow by themselves. The most urgent work goes first, and a call that would be
-late is refused when it arrives (``service.predict.scheduler``). Everything except the forward runs on the
-event loop, so there are no locks.
+alone, under heavy load batches grow by themselves. The most urgent work goes first
+(``service.predict.scheduler``). Everything except the forward runs on the event loop, so there are no locks.
 """
 
 import asyncio
-import math
 import os
 import time
-from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass, field, replace
-from typing import NoReturn, TypeVar
+from typing import TypeVar
 
 import structlog
 import torch
@@ -22,8 +19,9 @@ import torch
 from model.forecaster import Context, Forecaster, ModelInfo, Prepared, complete
 from model.mixture import TrajectoryMixture
 from model.scenes.scene import AgentType
-from service.errors import DeadlineExceeded, Internal, Overloaded, Unavailable
-from service.predict.scheduler import CostModel, DeadlineQueue, Throughput
+from service.errors import DeadlineExceeded, Internal, Unavailable
+from service.predict.admission import Admission, Call
+from service.predict.scheduler import DeadlineQueue
 from service.predict.torch_threads import set_forward_threads, set_helper_threads
 from service.telemetry.metrics import Metrics
 
@@ -31,59 +29,10 @@ _log = structlog.get_logger(__name__)
 
 _T = TypeVar("_T")
 
-_MIN_RETRY = 0.05
-_MAX_RETRY = 10.0
 _CUT_IN_THREADS = 8
 """Agents of a batch from which on map patches are cut in several threads."""
-_USABLE = 0.8
-"""Share of the time until the deadline that a call may be expected to take when it is admitted; estimates may
-be wrong by the rest."""
-
-
 _SPARE_SECONDS = 0.01
 """Seconds that a forward outside the queue may be expected to take."""
-
-
-class Call:
-    """A call that was admitted: its deadline, and the queue places that it holds until its batches start."""
-
-    def __init__(self, deadline: float) -> None:
-        """
-        Args:
-            deadline: the time on the event loop's clock, s.
-        """
-        self.deadline = deadline
-        """Deadline on the event loop's clock, s: the client's or the server's own, whichever is earlier."""
-        self.started = time.perf_counter()
-        """Start of the work for the call, by ``time.perf_counter``."""
-        self.helper_seconds = 0.0
-        """Seconds of work for the call in helper threads."""
-        self.places = 0
-        """Number of queue places held."""
-        self.caller: str | None = None
-        """Name of the caller's key; None: there is none."""
-        self.when_sent: Callable[[], None] | None = None
-        """Function to call once the response has been sent; None: there is none."""
-
-    def remaining(self) -> float:
-        """Return the seconds until the deadline; negative after it."""
-        return self.deadline - asyncio.get_running_loop().time()
-
-    @asynccontextmanager
-    async def in_time(self) -> AsyncIterator[None]:
-        """Cancel the block at the deadline.
-
-        Raises:
-            DeadlineExceeded: the deadline passed.
-        """
-        timeout = asyncio.timeout_at(self.deadline)
-        try:
-            async with timeout:
-                yield
-        except TimeoutError:
-            if not timeout.expired():
-                raise
-            raise DeadlineExceeded("the deadline passed before a forecast was made") from None
 
 
 @dataclass(frozen=True)
@@ -146,6 +95,11 @@ class _Entry:
         return self.call.deadline
 
     @property
+    def priority(self) -> int:
+        """Priority of the call."""
+        return self.call.priority
+
+    @property
     def finished(self) -> bool:
         """True if the entry has been cancelled or has failed meanwhile."""
         return self.done.done()
@@ -155,24 +109,22 @@ class Batcher:
     """Queue of jobs and thread of the forward."""
 
     def __init__(
-        self, max_batch_agents: int, max_queue_agents: int, metrics: Metrics, threads: int | None = None
+        self, max_batch_agents: int, admission: Admission, metrics: Metrics, threads: int | None = None
     ) -> None:
         """
         Args:
             max_batch_agents: max number of agents in one forward.
-            max_queue_agents: max number of agents admitted but not in the model yet.
+            admission: admits the calls whose jobs are queued.
             metrics: the metrics that count batches.
             threads: number of threads of the forward; None: torch's choice, the physical cores.
         """
         self._max_batch = max_batch_agents
-        self._max_queue = max_queue_agents
+        self._admission = admission
         self._metrics = metrics
-        self._costs = CostModel()
-        self._throughput = Throughput()
+        self._costs = admission.costs
         self._queue: DeadlineQueue[_Entry] = DeadlineQueue(self._costs)
         self._running: list[_Entry] = []
         self._running_since = 0.0
-        self._waiting = 0
         self._wake = asyncio.Event()
         self._thread = ThreadPoolExecutor(
             1, thread_name_prefix="forward", initializer=set_forward_threads, initargs=(threads,)
@@ -183,11 +135,6 @@ class Batcher:
         self._worker: asyncio.Task[None] | None = None
         self._crashed = False
         self._on_crash: Callable[[], None] | None = None
-
-    @property
-    def waiting(self) -> int:
-        """Number of agents admitted but not in the model yet."""
-        return self._waiting
 
     @property
     def forward_seconds(self) -> float:
@@ -214,62 +161,6 @@ class Batcher:
         await asyncio.to_thread(self._thread.shutdown)
         self._cutters.shutdown()
 
-    def admit(self, deadline: float) -> Call:
-        """Admit a call on its arrival, before any work is spent on it.
-
-        Args:
-            deadline: the time on the event loop's clock; work that has not started by then never does.
-
-        Raises:
-            Overloaded: the queue has no room for even the smallest call, or the call would be late.
-        """
-        self._require_room(1)
-        self._require_time(deadline, 0)
-        now = asyncio.get_running_loop().time()
-        expected = self._throughput.seconds_until(deadline)
-        if expected > _USABLE * (deadline - now):
-            self._refuse_as_late(expected, deadline - now)
-        return Call(deadline)
-
-    @contextmanager
-    def in_progress(self, call: Call) -> Iterator[None]:
-        """Count a call as worked on, for the expected time of later calls.
-
-        Args:
-            call: the call; its request has been received.
-        """
-        loop = asyncio.get_running_loop()
-        self._throughput.begin(call.deadline, loop.time())
-        finished = False
-        try:
-            yield
-            finished = True
-        finally:
-            self._throughput.end(call.deadline, loop.time(), finished)
-            if finished:
-                self._costs.measure_around(call.helper_seconds)
-
-    @contextmanager
-    def hold_places(self, call: Call, agents: int) -> Iterator[None]:
-        """Hold queue places for the agents of a call; those that are left at the end are given back.
-
-        Args:
-            call: the call.
-            agents: number of agents to forecast; a call without any takes one place.
-
-        Raises:
-            Overloaded: the queue has no room for so many, or they would be late.
-        """
-        agents = max(agents, 1)
-        self._require_room(agents)
-        self._require_time(call.deadline, agents)
-        call.places += agents
-        self._count(agents)
-        try:
-            yield
-        finally:
-            self._release(call, call.places)
-
     async def run(self, jobs: Sequence[Job], call: Call) -> list[Outcome]:
         """Run the jobs of a call, of any forecasters and types.
 
@@ -291,7 +182,7 @@ class Batcher:
         entries = [entry for part in parts for entry in part]
         surplus = call.places - sum(entry.agents for entry in entries)
         if surplus > 0:  # agents that need no forward give their places back at once
-            self._release(call, surplus)
+            self._admission.release(call, surplus)
         for part in parts:
             lag = 0.0
             for entry in part:
@@ -304,6 +195,7 @@ class Batcher:
         except BaseException:
             self._withdraw(entries)
             raise
+        call.delivered = asyncio.get_running_loop().time()
         return [combine([entry.done.result() for entry in part]) for part in parts]
 
     async def run_in_model_thread(self, job: Job) -> float:
@@ -315,7 +207,7 @@ class Batcher:
     @property
     def is_free(self) -> bool:
         """True if no call waits for the model or is in it."""
-        return not (self._running or self._waiting or self._queue)
+        return not (self._running or self._admission.waiting or self._queue)
 
     def spare_parts(self, job: Job) -> list[Job]:
         """Return a job in parts so small that calls which arrive meanwhile hardly wait, for ``run_spare``."""
@@ -367,6 +259,7 @@ class Batcher:
                 self._running_since = time.perf_counter()
                 await self._run_batch(self._running, self._running_since)
                 self._running = []
+                self._admission.busy_until = None
             elif not self._queue:
                 self._wake.clear()
 
@@ -407,12 +300,16 @@ class Batcher:
     def _take_batch(self) -> list[_Entry]:
         """Take the most urgent batch, and fail the entries that would be late."""
         now = asyncio.get_running_loop().time()
-        batch, late = self._queue.take_batch(now, self._max_batch)
+        batch, late, departure = self._queue.take_batch(now, self._max_batch)
         for entry in late:
             self._metrics.refused.labels("dropped").inc()
             entry.done.set_exception(DeadlineExceeded("the deadline passed while the call was queued"))
+        if batch:
+            self._metrics.batches.labels(departure.value).inc()
+            agents = sum(entry.agents for entry in batch)
+            self._admission.busy_until = now + self._costs.seconds(batch[0].key, agents)
         for entry in batch:
-            self._release(entry.call, entry.agents)
+            self._admission.release(entry.call, entry.agents)
         return batch
 
     def _deliver(
@@ -440,65 +337,6 @@ class Batcher:
         self._metrics.inference.labels(batch[0].job.forecaster.info.name).observe(seconds)
         for entry in batch:
             self._metrics.queue.observe(started - entry.queued)
-
-    def _require_room(self, agents: int) -> None:
-        if self._waiting + agents > self._max_queue:
-            self._metrics.refused.labels("queue_full").inc()
-            raise Overloaded(
-                f"{self._waiting} agents are queued, and at most {self._max_queue} may be",
-                self._retry_after(),
-            )
-
-    def _require_time(self, deadline: float, agents: int) -> None:
-        """Refuse a call that would be late.
-
-        A call is never refused while the model is free and nothing waits: estimates may be wrong.
-
-        Args:
-            deadline: the time on the event loop's clock, s.
-            agents: number of agents to forecast; 0: not known yet.
-
-        Raises:
-            Overloaded: work that goes first leaves too little time.
-        """
-        wait = self._expected_wait(deadline)
-        if wait == 0.0:
-            return
-        needed = wait + self._costs.seconds_of_unknown(agents) + self._costs.around
-        remaining = deadline - asyncio.get_running_loop().time()
-        if needed > remaining:
-            self._refuse_as_late(needed, remaining)
-
-    def _refuse_as_late(self, needed: float, remaining: float) -> NoReturn:
-        self._metrics.refused.labels("late").inc()
-        raise Overloaded(
-            f"the forecast would take {needed:.2f} s, and the deadline is in {max(remaining, 0):.2f} s",
-            self._retry_after(),
-        )
-
-    def _expected_wait(self, deadline: float) -> float:
-        """Return the expected seconds until the model is free for a new call of that deadline; 0 if it is."""
-        # The second forward of an agent is queued without a place
-        unplanned = max(self._waiting - self._queue.agents, 0)
-        wait = self._queue.seconds_before(deadline) + self._costs.seconds_of_unknown(unplanned)
-        if self._running:
-            running = sum(self._costs.seconds(entry.key, entry.agents) for entry in self._running)
-            wait += max(running - self.forward_seconds, 1e-3)
-        return wait
-
-    def _retry_after(self) -> float:
-        """Return the seconds until the work that is queued now should be done."""
-        return min(max(self._expected_wait(math.inf), _MIN_RETRY), _MAX_RETRY)
-
-    def _count(self, agents: int) -> None:
-        self._waiting += agents
-        self._metrics.queue_agents.set(self._waiting)
-
-    def _release(self, call: Call, agents: int) -> None:
-        """Give places of a call back; a second forward of an agent holds none."""
-        agents = min(agents, call.places)
-        call.places -= agents
-        self._count(-agents)
 
 
 def _forward(

@@ -10,6 +10,7 @@ from cab.forecast.v1 import admin_service_pb2 as admin_pb
 from cab.forecast.v1 import model_service_pb2 as pb
 from service.errors import BadField, PermissionDenied, Unavailable
 from service.lifecycle import Lifecycle, Phase
+from service.predict.admission import Admission
 from service.predict.batcher import Batcher
 from service.predict.catalog import Catalog, reference
 from service.predict.pipeline import Pipeline
@@ -38,9 +39,8 @@ class DataPlane:
         self._metrics = metrics
         self._lifecycle = Lifecycle()
         self._references = ModelReferences()
-        self._batcher = Batcher(
-            settings.max_batch_agents, settings.max_queue_agents, metrics, threads=settings.threads
-        )
+        self._admission = Admission(settings.max_batch_agents, settings.max_queue_agents, metrics)
+        self._batcher = Batcher(settings.max_batch_agents, self._admission, metrics, threads=settings.threads)
         self._threads = ThreadPoolExecutor(
             min(_MAX_WORKERS, (os.cpu_count() or 1) + 1),
             thread_name_prefix="calls",
@@ -68,7 +68,9 @@ class DataPlane:
             metrics,
         )
         """Calls of the consistency service."""
-        self._pipeline = Pipeline(settings, metrics, self._lifecycle, self._batcher, tracker, self._threads)
+        self._pipeline = Pipeline(
+            settings, metrics, self._lifecycle, self._admission, self._batcher, tracker, self._threads
+        )
         if settings.shadow is not None and shadow_tracker is not None:
             name, share = split_shadow(settings.shadow)
             self._pipeline.shadow = Shadow(name, share, settings, metrics, self._batcher, shadow_tracker)

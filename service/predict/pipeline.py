@@ -16,7 +16,8 @@ from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.forecaster import Forecaster
 from model.scenes.resample import history_seconds
 from service.lifecycle import Lifecycle
-from service.predict.batcher import Batcher, Call
+from service.predict.admission import Admission, Call
+from service.predict.batcher import Batcher
 from service.predict.catalog import Catalog
 from service.predict.encode import count_off_road, encode
 from service.predict.input_warnings import code_name, code_names
@@ -66,6 +67,7 @@ class Pipeline:
         settings: Settings,
         metrics: Metrics,
         lifecycle: Lifecycle,
+        admission: Admission,
         batcher: Batcher,
         tracker: Tracker,
         threads: Executor,
@@ -73,6 +75,7 @@ class Pipeline:
         self._settings = settings
         self._metrics = metrics
         self._lifecycle = lifecycle
+        self._admission = admission
         self._batcher = batcher
         self._tracker = tracker
         self._threads = threads
@@ -95,7 +98,7 @@ class Pipeline:
         self._lifecycle.require_ready()
         limit = self._settings.max_timeout
         seconds = limit if timeout is None else min(timeout, limit)
-        call = self._batcher.admit(asyncio.get_running_loop().time() + seconds)
+        call = self._admission.admit(asyncio.get_running_loop().time() + seconds)
         with self._lifecycle.in_progress():
             yield call
         if call.when_sent is not None:
@@ -117,27 +120,27 @@ class Pipeline:
             with self.accept() as accepted:
                 return await self.predict(request, accepted)
         call.started = time.perf_counter()
-        with self._batcher.in_progress(call):
-            async with call.in_time():
-                # Decode
-                message = await self._reader.read(request) if isinstance(request, EncodedRequest) else request
-                # Validate
-                catalog = self.catalog  # of the whole call, even if other models take over meanwhile
-                forecaster = catalog.get(message.model, call.caller)
-                options = read_options(message, forecaster.info, self._settings)
-                agents: Agents | None = None
-                recalled: TrackingResult | None = None
-                work = self._at_once if _is_light(message, options) else self._in_thread
-                with self._batcher.hold_places(call, options.predicted):
-                    # Recall
-                    if options.recalls:
-                        agents, recalled = await self._recall(message, options, forecaster, catalog, call)
-                    # Plan
-                    plan = await work(
-                        call, make_plan, message, options, forecaster, catalog, self._settings, agents
-                    )
-                    # Batch
-                    await self._forecast(plan, call, work)
+        async with call.in_time():
+            # Decode
+            message = await self._reader.read(request) if isinstance(request, EncodedRequest) else request
+            # Validate
+            catalog = self.catalog  # of the whole call, even if other models take over meanwhile
+            forecaster = catalog.get(message.model, call.caller)
+            options = read_options(message, forecaster.info, self._settings)
+            agents: Agents | None = None
+            recalled: TrackingResult | None = None
+            work = self._at_once if _is_light(message, options) else self._in_thread
+            with self._admission.in_progress(call, options.predicted, options.priority):
+                await self._admission.turn(call)
+                # Recall
+                if options.recalls:
+                    agents, recalled = await self._recall(message, options, forecaster, catalog, call)
+                # Plan
+                plan = await work(
+                    call, make_plan, message, options, forecaster, catalog, self._settings, agents
+                )
+                # Batch
+                await self._forecast(plan, call, work)
                 # Encode and remember; the track memory usually responds while the response is being encoded
                 encoding = work(call, self._encode, plan, _seed(options))
                 if not options.scene_id:

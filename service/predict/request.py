@@ -17,7 +17,7 @@ from google.protobuf.descriptor import FieldDescriptor
 
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
-from cab.forecast.v1.bounds import FIELD_BOUNDS, MAX_ID_LENGTH, PATCH_PIXELS, STEP_SECONDS
+from cab.forecast.v1.bounds import FIELD_BOUNDS, MAX_ID_LENGTH, MAX_PRIORITY, PATCH_PIXELS, STEP_SECONDS
 from model.arrays import Bools, Bytes, Float32s, Floats, Ints
 from model.forecaster import Context, ModelInfo
 from model.scenes.observations import JUMP_SLACK, MAX_SPEED, Observations
@@ -88,6 +88,8 @@ class Options:
     """Empty if the call is not tracked."""
     recalls: bool
     """Flag for histories from the track memory."""
+    priority: int
+    """Priority of the call, from 0; a higher one goes first."""
     consistency: bool
     """Flag for each agent's latest consistency in the response."""
 
@@ -143,6 +145,8 @@ def read_options(request: pb.PredictRequest, info: ModelInfo, settings: Settings
         raise BadField("options.context", f"{info.name} has no blind forecast")
     if options.history not in _RECALLS:
         raise BadField("options.history", f"unknown value {options.history}")
+    if options.priority > MAX_PRIORITY:
+        raise BadField("options.priority", f"must be at most {MAX_PRIORITY}")
     recalls = _RECALLS[options.history]
     for name, requested in (("history", recalls), ("consistency", options.consistency)):
         if requested and not request.scene_id:
@@ -175,6 +179,7 @@ def read_options(request: pb.PredictRequest, info: ModelInfo, settings: Settings
         predicted=predicted,
         scene_id=request.scene_id,
         recalls=recalls,
+        priority=options.priority,
         consistency=options.consistency,
     )
 

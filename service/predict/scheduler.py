@@ -1,28 +1,42 @@
 """Scheduling of the forward: how long work takes, what must wait, and which work goes next.
 
-Work is ordered by its deadline (earliest deadline first; Liu and Layland 1973). That order meets every
-deadline that can be met, but only while there is no more work than the model can do. Therefore calls that
-would be late are refused on arrival, and entries that have become late are dropped before they take the
-model's time.
+Work of the same priority is ordered by its deadline (earliest deadline first; Liu and Layland 1973). That
+order meets every deadline that can be met, but only while there is no more work than the model can do.
+Therefore calls that would be late are refused on arrival (``service.predict.admission``), and entries that
+have become late are dropped before they take the model's time.
 """
 
 import itertools
-import math
-from bisect import bisect_left, bisect_right, insort
-from collections import Counter
+from bisect import insort
 from collections.abc import Container, Hashable, Iterator
+from enum import StrEnum
 from typing import Generic, Protocol, TypeVar
 
 _FIRST_RATE = 500.0
 """agents/s; a guess until the first batch has been measured."""
 _SMOOTHING = 0.2
-_KEPT = 0.95
-"""Weight of earlier answers in the throughput: about the last twenty count."""
 MAX_BATCH_SECONDS = 0.05
 """Seconds that a batch may be expected to take, so that a call with a deadline of 100 ms never finds the
 model busy for longer."""
 MIN_BATCH_AGENTS = 32
 """A batch may always have so many agents: smaller ones waste the model."""
+
+
+Order = tuple[float, float]
+"""Negative priority and deadline: smaller ones are served first."""
+
+
+class Departure(StrEnum):
+    """Reason why a batch left with the work that it has."""
+
+    EMPTY = "empty"
+    """Nothing else waited that could share its forward."""
+    AGENTS = "agents"
+    """It reached the max number of agents."""
+    TIME = "time"
+    """It reached the time that a batch may take."""
+    DEADLINE = "deadline"
+    """With more work its most urgent part would have been late."""
 
 
 class Work(Protocol):
@@ -41,6 +55,10 @@ class Work(Protocol):
         """Deadline, s."""
 
     @property
+    def priority(self) -> int:
+        """Priority; a higher one goes first."""
+
+    @property
     def finished(self) -> bool:
         """True if the entry has been cancelled or has failed meanwhile."""
 
@@ -49,7 +67,7 @@ AnyWork = TypeVar("AnyWork", bound=Work)
 
 
 class CostModel:
-    """Smoothed rates of forwards, by the key of what shares them and by size, and the time around them.
+    """Smoothed rates of forwards, by the key of what shares them and by size, and the work around them.
 
     A forward of one agent takes far more than a hundredth of one of a hundred, so each power of two has its
     own rate.
@@ -58,8 +76,9 @@ class CostModel:
     def __init__(self) -> None:
         self._rates: dict[Hashable, dict[int, float]] = {}
         self._last_key: Hashable = None
-        self.around = 0.0
-        """Smoothed seconds of work for a call outside the model: planning and encoding."""
+        self._around: dict[int, float] = {}
+        self.after = 0.0
+        """Smoothed seconds from the end of a call's last forward until it is answered."""
 
     def seconds(self, key: Hashable, agents: int) -> float:
         """Return the expected seconds of a forward of so many agents."""
@@ -107,9 +126,35 @@ class CostModel:
         if self._last_key in gone:
             self._last_key = next(iter(self._rates), None)
 
-    def measure_around(self, seconds: float) -> None:
-        """Learn from a call that was answered."""
-        self.around += _SMOOTHING * (max(seconds, 0.0) - self.around)
+    def measure_around(self, agents: int, seconds: float, after: float) -> None:
+        """Learn from a call that was answered.
+
+        Args:
+            agents: number of its agents.
+            seconds: seconds of work for it outside the model, planning and encoding.
+            after: seconds from the end of its last forward until it was answered.
+        """
+        size = agents.bit_length()
+        known = self._around.get(size, seconds)
+        self._around[size] = known + _SMOOTHING * (seconds - known)
+        self.after += _SMOOTHING * (max(after, 0.0) - self.after)
+
+    def around(self, agents: int) -> float:
+        """Return the expected seconds of work outside the model for a call of so many agents.
+
+        They are those of the size that is nearest among those that have been answered. Of a larger one a
+        smaller call is expected to take its part; a larger call than those is not expected to take more, lest
+        it be refused because of a guess.
+        """
+        if not self._around:
+            return 0.0
+        size = agents.bit_length()
+        nearest = min(self._around, key=lambda one: (abs(one - size), -one))
+        return self._around[nearest] * min(2.0 ** (size - nearest), 1.0)
+
+    def work(self, agents: int) -> float:
+        """Return the expected seconds of all work for a call, by a model that is not known yet."""
+        return self.seconds_of_unknown(agents) + self.around(agents)
 
     def _rate(self, key: Hashable, agents: int) -> float:
         """Return the rate of the known size that is nearest, the larger one of two."""
@@ -120,65 +165,19 @@ class CostModel:
         return known[min(known, key=lambda one: (abs(one - size), -one))]
 
 
-class Throughput:
-    """Rate at which calls are finished, and the calls that are worked on.
-
-    It knows what the costs of forwards do not: that calls wait for the interpreter, for helper threads and
-    for busy neighbours. By Little's law a new call takes as long as the calls before it at that rate.
-    """
-
-    def __init__(self) -> None:
-        self._deadlines: list[float] = []
-        self._seconds = 0.0
-        self._calls = 0.0
-        self._since = 0.0
-
-    def begin(self, deadline: float, now: float) -> None:
-        """Begin a call."""
-        if not self._deadlines:
-            self._since = now
-        insort(self._deadlines, deadline)
-
-    def end(self, deadline: float, now: float, finished: bool) -> None:
-        """End a call.
-
-        Args:
-            deadline: its deadline.
-            now: the time.
-            finished: whether it was answered. The time of other calls counts as that of the next answer.
-        """
-        del self._deadlines[bisect_left(self._deadlines, deadline)]
-        if finished:
-            self._seconds = _KEPT * self._seconds + now - self._since
-            self._calls = _KEPT * self._calls + 1
-            self._since = now
-
-    def seconds_until(self, deadline: float) -> float:
-        """Return the expected seconds until a new call of that deadline is answered; 0 if nothing waits."""
-        if not self._deadlines or not self._calls:
-            return 0.0
-        return (bisect_right(self._deadlines, deadline) + 1) * self._seconds / self._calls
-
-
 class DeadlineQueue(Generic[AnyWork]):
-    """Queue of work, earliest deadline first; equal deadlines in order of arrival."""
+    """Queue of work by priority and deadline; equal ones in order of arrival."""
 
     def __init__(self, costs: CostModel) -> None:
         self._costs = costs
-        self._entries: list[tuple[float, int, AnyWork]] = []
+        self._entries: list[tuple[Order, int, AnyWork]] = []
         self._numbers = itertools.count()
-        self._agents: Counter[Hashable] = Counter()
 
     def __len__(self) -> int:
         return len(self._entries)
 
     def __iter__(self) -> Iterator[AnyWork]:
         return (entry for _, _, entry in self._entries)
-
-    @property
-    def agents(self) -> int:
-        """Number of queued agents."""
-        return self._agents.total()
 
     def put(self, entry: AnyWork, lag: float = 0.0) -> None:
         """Add an entry.
@@ -188,32 +187,18 @@ class DeadlineQueue(Generic[AnyWork]):
             lag: seconds by which it is ordered behind its deadline. Later parts of a large call lag behind
                 its first, so that small calls which arrive meanwhile need not wait for all of them.
         """
-        insort(self._entries, (entry.deadline + lag, next(self._numbers), entry))
-        self._agents[entry.key] += entry.agents
+        order = (-entry.priority, entry.deadline + lag)
+        insort(self._entries, (order, next(self._numbers), entry))
 
     def remove(self, entry: AnyWork) -> None:
         """Remove an entry if it is still queued."""
-        kept = [one for one in self._entries if one[2] is not entry]
-        if len(kept) < len(self._entries):
-            self._agents[entry.key] -= entry.agents
-        self._entries = kept
+        self._entries = [one for one in self._entries if one[2] is not entry]
 
     def clear(self) -> None:
         """Remove all entries."""
         self._entries.clear()
-        self._agents.clear()
 
-    def seconds_before(self, deadline: float) -> float:
-        """Return the expected seconds of the queued work that goes before a new entry of that deadline.
-
-        Entries count as equally large: this runs for every call that arrives.
-        """
-        if not self._entries:
-            return 0.0
-        share = bisect_right(self._entries, (deadline, math.inf)) / len(self._entries)
-        return share * sum(self._costs.seconds(key, agents) for key, agents in self._agents.items())
-
-    def take_batch(self, now: float, max_agents: int) -> tuple[list[AnyWork], list[AnyWork]]:
+    def take_batch(self, now: float, max_agents: int) -> tuple[list[AnyWork], list[AnyWork], Departure]:
         """Take the most urgent entry and what can share its forward, in order.
 
         A batch ends at the first entry of its key that does not fit, which nothing of that key may overtake.
@@ -225,35 +210,58 @@ class DeadlineQueue(Generic[AnyWork]):
             max_agents: the max number of agents in a batch.
 
         Returns:
-            The batch, and the entries that cannot meet their deadlines any more. Both have left the queue.
+            The batch, the entries that cannot meet their deadlines any more, and why the batch has no more
+            entries. Both have left the queue.
         """
-        batch: list[AnyWork] = []
         late: list[AnyWork] = []
-        rest: list[tuple[float, int, AnyWork]] = []
-        agents, limit, full = 0, max_agents, False
+        rest: list[tuple[Order, int, AnyWork]] = []
+        batch: _Batch[AnyWork] | None = None
         for item in self._entries:
             entry = item[2]
             if entry.finished:
                 continue
-            if entry.deadline < now + self._costs.seconds(entry.key, entry.agents):
+            if entry.deadline < now + self._costs.seconds(entry.key, entry.agents) + self._costs.after:
                 late.append(entry)
-            elif full or (batch and entry.key != batch[0].key):
+            elif batch is None:
+                batch = _Batch(entry, self._costs, now, max_agents)
+            elif not batch.add(entry):
                 rest.append(item)
-            elif batch and agents + entry.agents > limit:
-                full = True
-                rest.append(item)
-            else:
-                if not batch:
-                    limit = self._costs.batch_agents(entry.key, max_agents)
-                batch.append(entry)
-                agents += entry.agents
-        if not batch:
-            possible = next((entry for entry in late if entry.deadline > now), None)
-            if possible is not None:
-                late.remove(possible)
-                batch.append(possible)
         self._entries = rest
-        self._agents = Counter()
-        for _, _, entry in rest:
-            self._agents[entry.key] += entry.agents
-        return batch, late
+        if batch is not None:
+            return batch.entries, late, batch.departure
+        possible = next((entry for entry in late if entry.deadline > now), None)
+        if possible is None:
+            return [], late, Departure.EMPTY
+        late.remove(possible)
+        return [possible], late, Departure.DEADLINE
+
+
+class _Batch(Generic[AnyWork]):
+    """Entries that share a forward."""
+
+    def __init__(self, first: AnyWork, costs: CostModel, now: float, max_agents: int) -> None:
+        self.entries = [first]
+        self.departure = Departure.EMPTY
+        self._costs = costs
+        self._agents = first.agents
+        self._max_agents = max_agents
+        self._limit = costs.batch_agents(first.key, max_agents)
+        self._deadline = first.deadline
+        self._start = now + costs.after
+
+    def add(self, entry: AnyWork) -> bool:
+        """Add an entry if it fits; return whether it did. After one that did not none does."""
+        first = self.entries[0]
+        if self.departure is not Departure.EMPTY or entry.key != first.key:
+            return False
+        agents = self._agents + entry.agents
+        deadline = min(self._deadline, entry.deadline)
+        if agents > self._limit:
+            self.departure = Departure.AGENTS if self._limit == self._max_agents else Departure.TIME
+        elif self._start + self._costs.seconds(entry.key, agents) > deadline:
+            self.departure = Departure.DEADLINE
+        else:
+            self.entries.append(entry)
+            self._agents, self._deadline = agents, deadline
+            return True
+        return False

@@ -48,6 +48,12 @@ class Metrics:
             buckets=_SECONDS,
             registry=self.registry,
         )
+        self.turn = Histogram(
+            "forecast_turn_seconds",
+            "Time that accepted calls wait for their turn, before features are made of them.",
+            buckets=_SECONDS,
+            registry=self.registry,
+        )
         self.inference = Histogram(
             "forecast_inference_seconds",
             "Duration of one batch in the model.",
@@ -61,6 +67,16 @@ class Metrics:
             buckets=_AGENTS,
             registry=self.registry,
         )
+        self.batches = Counter(
+            "forecast_batches_total",
+            "Batches by the reason why they have no more agents: no others waited that could join (empty), "
+            "or with more they would have exceeded the max number (agents), would have taken too long "
+            "(time), or a call in them would have been late (deadline).",
+            ["reason"],
+            registry=self.registry,
+        )
+        for departure in ("empty", "agents", "time", "deadline"):
+            self.batches.labels(departure)
         self.agents = Counter(
             "forecast_agents_total",
             "Agents of answered calls, by requested model and status; the shadow's under name@version.",
@@ -93,12 +109,12 @@ class Metrics:
         self.refused = Counter(
             "forecast_refused_total",
             "Calls refused as overload: the queue was full, the forecast would have been late, or there were "
-            "too many calls, bytes of bodies or watchers; and calls dropped from the queue because they had "
-            "become late.",
+            "too many calls, bytes of bodies or watchers; and calls that left the queue because they had "
+            "become late (dropped) or calls of a higher priority had filled it (displaced).",
             ["reason"],
             registry=self.registry,
         )
-        for reason in ("queue_full", "late", "dropped", "concurrency", "bytes", "watchers"):
+        for reason in ("queue_full", "late", "dropped", "displaced", "concurrency", "bytes", "watchers"):
             self.refused.labels(reason)
         self.model_info = Gauge(
             "forecast_model_info",

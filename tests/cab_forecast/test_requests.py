@@ -167,6 +167,7 @@ def test_options() -> None:
         strict=True,
         history="memory",
         consistency=True,
+        priority=3,
     )
     assert (full.scene_id, full.model) == ("s", "m@1")
     options = full.options
@@ -176,6 +177,7 @@ def test_options() -> None:
     assert options.strict
     assert options.history == HISTORY_SOURCE_MEMORY
     assert options.consistency
+    assert options.priority == 3
     assert not options.merge
     with pytest.raises(ValueError, match="full, blind, not 'none'"):
         predict_request(1.0, [], context="none")  # type: ignore[arg-type]

@@ -28,6 +28,8 @@ def options(tmp_path: Path) -> Options:
         deadline=30.0,
         uploads=10,
         half_headers=20,
+        readers=5,
+        max_slowdown=100.0,
         max_probe_seconds=20.0,
         retry_seconds=120.0,
     )
@@ -58,6 +60,10 @@ async def test_what_is_accepted_is_answered_and_right(options: Options) -> None:
         assert cancelled.counts["cancelled"] + cancelled.counts["in time"] == 20
         [uploads] = await run(session, "slow-uploads")
         assert uploads.counts == {"in time": 20}
+
+        [readers] = await run(session, "slow-readers")
+        assert readers.counts == {"in time": 20}
+        await run(session, "neighbour")
 
         [overload] = await run(session, "overload", rate=None, peak=None, peak_seconds=0.5, deadline=2.0)
         assert overload.counts["in time"] > overload.counts["late"]

@@ -1,7 +1,8 @@
 """gRPC handlers of the contract's methods.
 
-The handlers take and return bytes. A request that is too large or malformed therefore fails like any other
-bad request, with error details, and not without details inside gRPC.
+The handlers read and return bytes. A request that is too large or malformed therefore fails like any other
+bad request, with error details, and not without details inside gRPC. Predict reads its request after the call
+has been accepted.
 
 gRPC cancels a handler when the client disconnects or its deadline passes, which removes the call from any
 queue that it waits in.
@@ -10,7 +11,7 @@ queue that it waits in.
 import asyncio
 import functools
 from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import ExitStack, asynccontextmanager
+from contextlib import asynccontextmanager
 from typing import Any
 
 import grpc
@@ -25,6 +26,7 @@ from service.predict.request_reader import LARGE_BYTES, EncodedRequest, RequestL
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
 from service.transports.calls import UNARY_METHODS, parse_message, record_call
+from service.transports.grpc.intake import Incoming
 from service.transports.grpc.status import abort
 from service.transports.streams import closing
 
@@ -56,34 +58,34 @@ class Handlers:
             for service in SERVICES
         ]
 
-    async def _predict(self, body: bytes, context: Context) -> Message:
+    async def _predict(self, incoming: Incoming, context: Context) -> Message:
         # The call counts as in progress until the response was sent, not only until this returns.
-        stack = ExitStack()
-        call = stack.enter_context(self._dataplane.accept(context.time_remaining()))
-        context.add_done_callback(lambda _: stack.close())
+        call = incoming.hold(self._dataplane.accept(context.time_remaining()))
+        body = await self._read(incoming)
         return await self._dataplane.predict(EncodedRequest(body, self._read_request, LARGE_BYTES), call)
 
     def _watch_scene(self, request: WatchSceneRequest) -> AsyncIterator[Message]:
         return self._dataplane.consistency.watch_scene(request)
 
     def _bytes(
-        self, route: Route[Any, Any], behavior: Callable[[bytes, Context], Awaitable[Message]]
+        self, route: Route[Any, Any], behavior: Callable[[Incoming, Context], Awaitable[Message]]
     ) -> "grpc.RpcMethodHandler[bytes, bytes]":
-        """Return the handler of a method that parses its request itself."""
+        """Return the handler of a method that reads and parses its request itself."""
 
-        async def handle(body: bytes, context: Context) -> bytes:
-            async with self._recorded(route, body, context):
-                return (await behavior(body, context)).SerializeToString()
+        async def handle(incoming: Incoming, context: Context) -> bytes:
+            async with self._recorded(route, context):
+                incoming.accept()
+                return (await behavior(incoming, context)).SerializeToString()
 
-        return grpc.unary_unary_rpc_method_handler(handle)
+        return _handler(grpc.unary_unary_rpc_method_handler, handle)
 
     def _unary(
         self, route: Route[Request, Response], behavior: Callable[[Request], Awaitable[Message]]
     ) -> "grpc.RpcMethodHandler[bytes, bytes]":
         """Return the handler of a method with small requests."""
 
-        async def parse_and_execute(body: bytes, _: Context) -> Message:
-            return await behavior(parse_message(route.request, body))
+        async def parse_and_execute(incoming: Incoming, _: Context) -> Message:
+            return await behavior(parse_message(route.request, await self._read(incoming)))
 
         return self._bytes(route, parse_and_execute)
 
@@ -92,29 +94,38 @@ class Handlers:
     ) -> "grpc.RpcMethodHandler[bytes, bytes]":
         """Return the handler of a method that responds with a stream."""
 
-        async def handle(body: bytes, context: Context) -> None:
-            async with self._recorded(route, body, context):
-                events = behavior(parse_message(route.request, body))
+        async def handle(incoming: Incoming, context: Context) -> None:
+            async with self._recorded(route, context):
+                events = behavior(parse_message(route.request, await self._read(incoming)))
                 async with closing(events):
                     async for event in events:
                         await _send(context, event)
 
-        return grpc.unary_stream_rpc_method_handler(handle)
+        return _handler(grpc.unary_stream_rpc_method_handler, handle)
+
+    async def _read(self, incoming: Incoming) -> bytes:
+        """Return the body of a request; refuse one that is too large."""
+        body = await incoming.read()
+        if len(body) > self._max_bytes:
+            raise TooLarge(f"the request has {len(body)} bytes; at most {self._max_bytes} are accepted")
+        return body
 
     @asynccontextmanager
-    async def _recorded(self, route: Route[Any, Any], body: bytes, context: Context) -> AsyncIterator[None]:
-        """Record a call, bound its size, and turn exceptions into a status with details."""
+    async def _recorded(self, route: Route[Any, Any], context: Context) -> AsyncIterator[None]:
+        """Record a call, and turn exceptions into a status with details."""
         with record_call(self._metrics, "grpc", route.method, timed=not route.streaming) as recorder:
             try:
-                if len(body) > self._max_bytes:
-                    raise TooLarge(
-                        f"the request has {len(body)} bytes; at most {self._max_bytes} are accepted"
-                    )
                 yield
             except Exception as exception:
                 await abort(context, recorder.failed(exception))
                 raise  # unreachable: abort raises
             recorder.succeeded()
+
+
+def _handler(make: Any, handle: Callable[[Incoming, Context], Any]) -> "grpc.RpcMethodHandler[bytes, bytes]":
+    """Return a handler of bytes; the interceptor of the intake calls it with the incoming request instead."""
+    handler: grpc.RpcMethodHandler[bytes, bytes] = make(handle)
+    return handler
 
 
 async def _send(context: Context, message: Message) -> None:

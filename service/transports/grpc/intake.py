@@ -1,14 +1,16 @@
 """Bounded intake of gRPC requests.
 
 gRPC would read the request of a unary call before it calls the handler. On the wire a unary request is a
-stream of one message, so the interceptor below registers each method as a stream and reads that message
-itself, once the call has been accepted, and within limits of time and bytes.
+stream of one message, so the interceptor below registers each method as a stream. The handlers of the
+contract's methods get an ``Incoming`` in place of the request, and read it within limits of time and bytes
+once they have accepted the call; a refused call costs no more than its headers. All other methods get their
+requests as usual.
 """
 
 import asyncio
 from collections.abc import Awaitable, Callable
-from contextlib import ExitStack
-from typing import Any
+from contextlib import AbstractContextManager, ExitStack
+from typing import Any, TypeVar
 
 import grpc
 from grpc import aio
@@ -17,7 +19,7 @@ from service.errors import BadField, RequestTimeout, ServiceError
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
 from service.transports.grpc.status import abort
-from service.transports.intake import Body, Intake
+from service.transports.intake import Intake
 
 RECEIVE_MARGIN = 2
 """Factor on the request limit up to which messages are received, so that they are refused with error
@@ -29,63 +31,49 @@ _CONTRACT = "/cab."
 
 _Handler = grpc.RpcMethodHandler
 _Context = Any  # generic in the message types
+_T = TypeVar("_T")
 
 
-class IntakeInterceptor(aio.ServerInterceptor):  # type: ignore[type-arg]  # generic in the stubs only
-    """Interceptor that reads requests within the bounds of the intake.
+class Incoming:
+    """Request of a call of the contract that has not been read yet."""
 
-    Calls of the contract count against the bound of calls, except streams; health and reflection do not.
-    """
-
-    def __init__(self, intake: Intake, metrics: Metrics, settings: Settings) -> None:
+    def __init__(self, intake: Intake, settings: Settings, context: _Context) -> None:
         self._intake = intake
-        self._metrics = metrics
+        self._context = context
         self._timeout = settings.body_timeout
         # A budget of less than one such message must not refuse every slow client.
         self._slow_bytes = min(settings.max_request_bytes * RECEIVE_MARGIN, settings.max_large_intake_bytes)
-
-    async def intercept_service(
-        self,
-        continuation: Callable[[grpc.HandlerCallDetails], Awaitable["_Handler[Any, Any]"]],
-        handler_call_details: grpc.HandlerCallDetails,
-    ) -> "_Handler[Any, Any]":
-        """Return a handler that reads the request and calls the method's handler with it."""
-        handler = await continuation(handler_call_details)
-        if handler is None or handler.request_streaming:
-            return handler
-        method = handler_call_details.method
-        counted = method.startswith(_CONTRACT) and not handler.response_streaming
-        behavior: Any = handler.unary_stream if handler.response_streaming else handler.unary_unary
-
-        async def handle(_: object, context: _Context) -> Any:
-            return await behavior(await self._accept(method, counted, context), context)
-
-        make: Any = (
-            grpc.stream_stream_rpc_method_handler
-            if handler.response_streaming
-            else grpc.stream_unary_rpc_method_handler
-        )
-        wrapped: _Handler[Any, Any] = make(handle, handler.request_deserializer, handler.response_serializer)
-        return wrapped
-
-    async def _accept(self, method: str, counted: bool, context: _Context) -> Any:
-        """Return the request of a call that is accepted; end the others with an error."""
-        stack = ExitStack()
+        self._write_timeout = settings.write_timeout
+        self._unread: asyncio.TimerHandle | None = None
+        self._stack = ExitStack()
         # The call counts until its response has been sent, not only until the handler returns.
-        context.add_done_callback(lambda _: stack.close())
-        try:
-            if counted:
-                stack.enter_context(self._intake.call())
-            body = stack.enter_context(self._intake.body())
-            return await self._receive(context, body)
-        except ServiceError as error:
-            name = method.rpartition("/")[2] if method.startswith(_CONTRACT) else "other"
-            with self._metrics.call("grpc", name) as call:
-                call.code = error.code
-                await abort(context, error)
-            raise  # unreachable: abort raises
+        context.add_done_callback(lambda _: self._end())
 
-    async def _receive(self, context: _Context, body: Body) -> Any:
+    def hold(self, counted: AbstractContextManager[_T]) -> _T:
+        """Enter a context that ends when the response has been sent."""
+        return self._stack.enter_context(counted)
+
+    def accept(self) -> None:
+        """Count the call against the bound of calls.
+
+        Raises:
+            Overloaded: there are too many calls.
+        """
+        self.hold(self._intake.call())
+
+    def send_in_time(self) -> None:
+        """Let the call count no longer than the write timeout from now on: its response is being sent.
+
+        gRPC itself ends it only when the client has read the response, is gone, or its deadline has passed.
+        """
+        self._unread = asyncio.get_running_loop().call_later(self._write_timeout, self._stack.close)
+
+    def _end(self) -> None:
+        if self._unread is not None:
+            self._unread.cancel()
+        self._stack.close()
+
+    async def read(self) -> bytes:
         """Return the request.
 
         Raises:
@@ -93,6 +81,7 @@ class IntakeInterceptor(aio.ServerInterceptor):  # type: ignore[type-arg]  # gen
             RequestTimeout: the request did not arrive in time.
             BadField: the client sent none.
         """
+        body = self.hold(self._intake.body())
         loop = asyncio.get_running_loop()
         refusal: ServiceError = RequestTimeout(f"the request did not arrive within {self._timeout:g} s")
 
@@ -108,15 +97,61 @@ class IntakeInterceptor(aio.ServerInterceptor):  # type: ignore[type-arg]  # gen
         slow = loop.call_later(SLOW_SECONDS, count_as_largest)
         try:
             async with limit:
-                request = await context.read()
+                request = await self._context.read()
         except TimeoutError as error:
             raise refusal from error
         finally:
             slow.cancel()
         if request is aio.EOF:  # type: ignore[attr-defined]  # the stubs lack it
             raise BadField("body", "is missing")
-        if isinstance(request, bytes):  # the contract's methods, which parse their requests themselves
-            body.resize(len(request))
-        else:
-            body.resize(0)
-        return request
+        # The contract's methods parse their requests themselves; those of others are small
+        received: bytes = request
+        body.resize(len(received) if isinstance(received, bytes) else 0)
+        return received
+
+
+class IntakeInterceptor(aio.ServerInterceptor):  # type: ignore[type-arg]  # generic in the stubs only
+    """Interceptor that lets handlers accept a call before its request is read."""
+
+    def __init__(self, intake: Intake, metrics: Metrics, settings: Settings) -> None:
+        self._intake = intake
+        self._metrics = metrics
+        self._settings = settings
+
+    async def intercept_service(
+        self,
+        continuation: Callable[[grpc.HandlerCallDetails], Awaitable["_Handler[Any, Any]"]],
+        handler_call_details: grpc.HandlerCallDetails,
+    ) -> "_Handler[Any, Any]":
+        """Return a handler of a stream that calls the method's handler."""
+        handler = await continuation(handler_call_details)
+        if handler is None or handler.request_streaming:
+            return handler
+        in_contract = handler_call_details.method.startswith(_CONTRACT)
+        behavior: Any = handler.unary_stream if handler.response_streaming else handler.unary_unary
+
+        async def handle(_: object, context: _Context) -> Any:
+            incoming = Incoming(self._intake, self._settings, context)
+            response = await behavior(
+                incoming if in_contract else await self._read(incoming, context), context
+            )
+            incoming.send_in_time()
+            return response
+
+        make: Any = (
+            grpc.stream_stream_rpc_method_handler
+            if handler.response_streaming
+            else grpc.stream_unary_rpc_method_handler
+        )
+        wrapped: _Handler[Any, Any] = make(handle, handler.request_deserializer, handler.response_serializer)
+        return wrapped
+
+    async def _read(self, incoming: Incoming, context: _Context) -> Any:
+        """Return the request of a method outside the contract."""
+        try:
+            return await incoming.read()
+        except ServiceError as error:
+            with self._metrics.call("grpc", "other") as call:
+                call.code = error.code
+                await abort(context, error)
+            raise  # unreachable: abort raises

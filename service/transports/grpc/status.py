@@ -1,5 +1,6 @@
 """Errors as google.rpc.Status with details; the counterpart of REST's problem documents."""
 
+import functools
 from collections.abc import Sequence
 
 import grpc
@@ -21,7 +22,7 @@ _MAX_TEXT = 200
 def to_status(error: ServiceError) -> status_pb2.Status:
     """Return the status of an error: always with ErrorInfo, with BadRequest if fields are wrong, and with
     RetryInfo if a retry may succeed."""
-    details = [_pack(error_details_pb2.ErrorInfo(reason=error.reason, domain=DOMAIN))]
+    details = [_info(error.reason)]
     if error.faults:
         details.append(_pack(_bad_request(error.faults)))
     if error.retry_after is not None:
@@ -37,6 +38,12 @@ async def abort(context: "grpc.aio.ServicerContext[object, object]", error: Serv
     status = to_status(error)
     metadata = ((DETAILS_KEY, status.SerializeToString()),)
     await context.abort(grpc.StatusCode[error.code], status.message, metadata)
+
+
+@functools.cache
+def _info(reason: str) -> any_pb2.Any:
+    """Return the ErrorInfo of a reason, made once: under overload most calls end with the same one."""
+    return _pack(error_details_pb2.ErrorInfo(reason=reason, domain=DOMAIN))
 
 
 def _bad_request(faults: Sequence[Fault]) -> error_details_pb2.BadRequest:

@@ -26,12 +26,14 @@ class Connections:
     """Seconds from the connection, or the first byte of a later request, to the end of its headers."""
     body_timeout: float
     """Seconds from the end of the headers to the end of the body."""
+    write_timeout: float
+    """Seconds for which a client may leave a full buffer of its response unread."""
     waiting: "dict[BoundedProtocol, None]" = field(default_factory=dict)
     """Connections without a request in progress, longest waiting first."""
 
 
 class BoundedProtocol(HttpToolsProtocol):
-    """HTTP/1.1 connection with timeouts while it receives, and a limit of its headers.
+    """HTTP/1.1 connection with timeouts while it receives and sends, and a limit of its headers.
 
     Beyond ``max_connections`` a new connection takes the place of the one that has been waiting longest for
     the headers of a request. So connections that send none, or half of them, do not keep others out.
@@ -43,6 +45,7 @@ class BoundedProtocol(HttpToolsProtocol):
         self._header_bytes = 0
         self._in_headers = True
         self._timer: asyncio.TimerHandle | None = None
+        self._writing: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Count the connection, and wait for its headers."""
@@ -58,7 +61,19 @@ class BoundedProtocol(HttpToolsProtocol):
         """Stop waiting."""
         self._limits.waiting.pop(self, None)
         self._set_timer(None)
+        self._stop_write_timer()
         super().connection_lost(exc)
+
+    def pause_writing(self) -> None:
+        """Wait for the client to read: the buffer of the response is full."""
+        super().pause_writing()
+        self._stop_write_timer()
+        self._writing = self.loop.call_later(self._limits.write_timeout, self.transport.abort)
+
+    def resume_writing(self) -> None:
+        """Stop waiting: the client has read."""
+        super().resume_writing()
+        self._stop_write_timer()
 
     def data_received(self, data: bytes) -> None:
         """Parse data; refuse headers that are too large."""
@@ -115,6 +130,11 @@ class BoundedProtocol(HttpToolsProtocol):
                 b"HTTP/1.1 " + status + b"\r\nconnection: close\r\ncontent-length: 0\r\n\r\n"
             )
         self.transport.close()
+
+    def _stop_write_timer(self) -> None:
+        if self._writing is not None:
+            self._writing.cancel()
+            self._writing = None
 
     def _set_timer(self, seconds: float | None, on_timeout: Callable[[], None] | None = None) -> None:
         if self._timer is not None:

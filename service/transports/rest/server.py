@@ -81,7 +81,9 @@ class HttpServer:
 
     def __init__(self, app: FastAPI, settings: Settings) -> None:
         self._configured_address = settings.http
-        limits = Connections(_max_connections(settings), settings.header_timeout, settings.body_timeout)
+        limits = Connections(
+            _max_connections(settings), settings.header_timeout, settings.body_timeout, settings.write_timeout
+        )
         protocol: Any = functools.partial(BoundedProtocol, limits)
         self._server = _Uvicorn(
             uvicorn.Config(

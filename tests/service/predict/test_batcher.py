@@ -1,4 +1,4 @@
-"""The queue: who rides with whom, who is refused, and who leaves it."""
+"""Batches: which calls share a forward, and what becomes of calls that fail or leave."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
@@ -13,7 +13,8 @@ from model.forecaster import Context, Features, Prepared
 from model.mixture import TrajectoryMixture
 from model.scenes.scene import AgentType
 from service.errors import DeadlineExceeded, Internal, Overloaded, Unavailable
-from service.predict.batcher import Batcher, Call, Job, Outcome
+from service.predict.admission import Admission, Call
+from service.predict.batcher import Batcher, Job, Outcome
 from service.telemetry.metrics import Metrics
 from tests.service.fakes import FakeForecaster
 
@@ -22,9 +23,14 @@ VEHICLE, PEDESTRIAN = AgentType.VEHICLE, AgentType.PEDESTRIAN
 
 
 @pytest.fixture
-async def batcher() -> AsyncIterator[Batcher]:
+def admission() -> Admission:
     """At most 8 agents in a batch and 20 in the queue."""
-    made = Batcher(8, 20, Metrics())
+    return Admission(8, 20, Metrics())
+
+
+@pytest.fixture
+async def batcher(admission: Admission) -> AsyncIterator[Batcher]:
+    made = Batcher(8, admission, Metrics())
     made.start()
     yield made
     await made.stop()
@@ -55,10 +61,13 @@ def job(
     return Job(fake, kind, context, Prepared(features(agents, x)), steps)
 
 
-def submit(batcher: Batcher, *jobs: Job, deadline: float = FAR) -> "asyncio.Task[list[Outcome]]":
+def submit(
+    batcher: Batcher, *jobs: Job, deadline: float = FAR, priority: int = 0
+) -> "asyncio.Task[list[Outcome]]":
     async def call() -> list[Outcome]:
-        admitted = batcher.admit(deadline)
-        with batcher.hold_places(admitted, sum(each.agents for each in jobs)):
+        admission = batcher._admission
+        admitted = admission.admit(deadline)
+        with admission.in_progress(admitted, sum(each.agents for each in jobs), priority):
             return await batcher.run(jobs, admitted)
 
     return asyncio.create_task(call())
@@ -80,7 +89,7 @@ async def test_waiting_calls_share_a_batch(batcher: Batcher, fake: FakeForecaste
     first = await hold(batcher, fake)
     second, third = submit(batcher, job(fake, 2, x=100.0)), submit(batcher, job(fake, 3, x=200.0))
     await settle()
-    assert batcher.waiting == 5
+    assert batcher._admission.waiting == 5
     fake.free.set()
     await first
     [two], [three] = await second, await third
@@ -90,7 +99,7 @@ async def test_waiting_calls_share_a_batch(batcher: Batcher, fake: FakeForecaste
     assert three.mixture.origin[:, 0].tolist() == [200.0, 201.0, 202.0]
     assert two.queue > 0
     assert two.inference == three.inference > 0
-    assert batcher.waiting == 0
+    assert batcher._admission.waiting == 0
 
 
 async def test_a_lone_call_does_not_wait(batcher: Batcher, fake: FakeForecaster) -> None:
@@ -149,6 +158,37 @@ async def test_a_large_job_is_split_and_put_together(batcher: Batcher, fake: Fak
     assert outcome.batch_agents == 8
 
 
+async def test_many_small_calls_need_not_wait_for_all_of_a_large_one(fake: FakeForecaster) -> None:
+    admission = Admission(8, 200, Metrics())
+    batcher = Batcher(8, admission, Metrics())
+    batcher.start()
+    first = await hold(batcher, fake)
+    admission.costs.measure(job(fake, 8).key, 8, 0.02)
+    deadline = asyncio.get_running_loop().time() + 1000.0
+    large = submit(batcher, job(fake, 64), deadline=deadline)
+    small = [submit(batcher, job(fake, 1), deadline=deadline + 0.01) for _ in range(20)]
+    await settle()
+    fake.free.set()
+    await asyncio.gather(first, large, *small)
+    # One part of the large call goes first, then all small ones, with which the rest can share no forward
+    assert [agents for _, agents, _, _ in fake.batches] == [1, 8, 8, 8, 4, *[8] * 7]
+    await batcher.stop()
+
+
+async def test_a_higher_priority_goes_first(batcher: Batcher, fake: FakeForecaster) -> None:
+    first = await hold(batcher, fake)
+    order: list[str] = []
+    calls = []
+    for name, priority in (("low", 0), ("high", 7), ("middle", 3)):
+        calls.append(submit(batcher, job(fake, 5), priority=priority))
+        calls[-1].add_done_callback(lambda _, name=name: order.append(name))  # type: ignore[misc]
+    await settle()
+    fake.free.set()
+    await asyncio.gather(first, *calls)
+    await settle()
+    assert order == ["high", "middle", "low"]
+
+
 async def test_jobs_of_one_call_come_back_in_order(batcher: Batcher, fake: FakeForecaster) -> None:
     fake.free.set()
     outcomes = await submit(batcher, job(fake, 2, x=10.0), job(fake, 1, kind=PEDESTRIAN, x=20.0))
@@ -170,17 +210,19 @@ async def test_a_full_queue_refuses(batcher: Batcher, fake: FakeForecaster) -> N
 
 
 async def test_places_are_given_back_without_a_forward(batcher: Batcher) -> None:
-    call = batcher.admit(FAR)
-    with batcher.hold_places(call, 15):
-        assert batcher.waiting == 15
+    admission = batcher._admission
+    call = admission.admit(FAR)
+    with admission.in_progress(call, 15):
+        assert batcher._admission.waiting == 15
         assert await batcher.run([], call) == []
-        assert batcher.waiting == 0
-    assert batcher.waiting == 0
+        assert batcher._admission.waiting == 0
+    assert batcher._admission.waiting == 0
 
 
 async def test_empty_calls_count(batcher: Batcher) -> None:
-    with batcher.hold_places(batcher.admit(FAR), 0):
-        assert batcher.waiting == 1
+    admission = batcher._admission
+    with admission.in_progress(admission.admit(FAR), 0):
+        assert batcher._admission.waiting == 1
 
 
 async def test_a_late_call_never_runs(batcher: Batcher, fake: FakeForecaster) -> None:
@@ -192,7 +234,7 @@ async def test_a_late_call_never_runs(batcher: Batcher, fake: FakeForecaster) ->
         await late
     await first
     assert len(fake.batches) == 1
-    assert batcher.waiting == 0
+    assert batcher._admission.waiting == 0
 
 
 async def test_a_cancelled_call_leaves_the_queue(batcher: Batcher, fake: FakeForecaster) -> None:
@@ -201,7 +243,7 @@ async def test_a_cancelled_call_leaves_the_queue(batcher: Batcher, fake: FakeFor
     await settle()
     gone.cancel()
     await settle()
-    assert batcher.waiting == 3
+    assert batcher._admission.waiting == 3
     fake.free.set()
     await asyncio.gather(first, stays)
     assert [agents for _, agents, _, _ in fake.batches] == [1, 3]
@@ -236,7 +278,7 @@ async def test_a_call_of_two_jobs_fails_as_one(batcher: Batcher, fake: FakeForec
     with pytest.raises(Internal):
         await submit(batcher, job(fake, 1), job(fake, 1, kind=PEDESTRIAN))
     await settle()
-    assert batcher.waiting == 0
+    assert batcher._admission.waiting == 0
 
 
 async def test_a_forward_of_the_wrong_size_is_a_failure(
@@ -291,7 +333,7 @@ async def test_a_crash_of_the_worker_fails_every_call(
     fake: FakeForecaster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     crashed = asyncio.Event()
-    batcher = Batcher(8, 20, Metrics())
+    batcher = Batcher(8, Admission(8, 20, Metrics()), Metrics())
     batcher.start(crashed.set)
     running = await hold(batcher, fake)
     queued = submit(batcher, job(fake, 1, kind=PEDESTRIAN))
@@ -303,13 +345,13 @@ async def test_a_crash_of_the_worker_fails_every_call(
         for call in (running, queued, submit(batcher, job(fake, 1))):
             with pytest.raises(Internal):
                 await call
-    assert (batcher.waiting, batcher.forward_seconds) == (0, 0.0)
+    assert (batcher._admission.waiting, batcher.forward_seconds) == (0, 0.0)
     await batcher.stop()
 
 
 async def test_a_stop_is_no_crash(fake: FakeForecaster) -> None:
     crashed = asyncio.Event()
-    batcher = Batcher(8, 20, Metrics())
+    batcher = Batcher(8, Admission(8, 20, Metrics()), Metrics())
     batcher.start(crashed.set)
     await settle()
     await batcher.stop()
@@ -329,7 +371,7 @@ async def test_the_age_of_a_forward_is_known(batcher: Batcher, fake: FakeForecas
 
 
 async def test_stop_fails_what_waits_and_finishes_what_runs(fake: FakeForecaster) -> None:
-    batcher = Batcher(8, 20, Metrics())
+    batcher = Batcher(8, Admission(8, 20, Metrics()), Metrics())
     batcher.start()
     first = await hold(batcher, fake)
     second = submit(batcher, job(fake, 1))
@@ -346,7 +388,7 @@ async def test_stop_fails_what_waits_and_finishes_what_runs(fake: FakeForecaster
 async def test_a_second_forward_needs_no_place(batcher: Batcher, fake: FakeForecaster) -> None:
     fake.free.set()
     assert await batcher.run([job(fake, 3)], Call(FAR))
-    assert batcher.waiting == 0
+    assert batcher._admission.waiting == 0
 
 
 async def test_warm_up_goes_past_the_queue(batcher: Batcher, fake: FakeForecaster) -> None:
@@ -364,7 +406,7 @@ async def test_threads_of_the_forward() -> None:
             return super().forecast(*arguments, **named)
 
     before = torch.get_num_threads()
-    batcher = Batcher(8, 20, Metrics(), threads=1)
+    batcher = Batcher(8, Admission(8, 20, Metrics()), Metrics(), threads=1)
     batcher.start()
     try:
         await submit(batcher, job(Counting(), 1))

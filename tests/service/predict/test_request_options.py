@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
-from cab.forecast.v1.bounds import FIELD_BOUNDS, MAX_ID_LENGTH
+from cab.forecast.v1.bounds import FIELD_BOUNDS, MAX_ID_LENGTH, MAX_PRIORITY
 from model.forecaster import Context
 from service.errors import BadField, TooLarge
 from service.predict.request import Options, read_options, read_raster
@@ -35,8 +35,15 @@ def test_defaults() -> None:
         predicted=2,
         scene_id="",
         recalls=False,
+        priority=0,
         consistency=False,
     )
+
+
+def test_priority() -> None:
+    assert read(make_request(priority=MAX_PRIORITY)).priority == MAX_PRIORITY
+    with pytest.raises(BadField, match=f"options.priority: must be at most {MAX_PRIORITY}"):
+        read(make_request(priority=MAX_PRIORITY + 1))
 
 
 def test_everything_given() -> None:
@@ -50,6 +57,7 @@ def test_everything_given() -> None:
         strict=True,
         horizon=2.5,
         history=pb.HISTORY_SOURCE_MEMORY,
+        priority=2,
         consistency=True,
     )
     request.scene_id = "s" * MAX_ID_LENGTH
@@ -66,6 +74,7 @@ def test_everything_given() -> None:
         predicted=2,
         scene_id=request.scene_id,
         recalls=True,
+        priority=2,
         consistency=True,
     )
 

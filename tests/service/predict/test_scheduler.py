@@ -1,4 +1,4 @@
-"""Earliest deadline first, and expected waits."""
+"""Order and size of batches, and costs of forwards."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from service.predict.scheduler import (
     MIN_BATCH_AGENTS,
     CostModel,
     DeadlineQueue,
-    Throughput,
+    Departure,
 )
 
 
@@ -21,6 +21,7 @@ class Entry:
     agents: int = 1
     key: str = "model"
     finished: bool = False
+    priority: int = 0
 
 
 def costs(rate: float = 1000.0, key: str = "model") -> CostModel:
@@ -38,7 +39,7 @@ def queue(*entries: Entry, rate: float = 1000.0) -> DeadlineQueue[Entry]:
 
 def test_the_earliest_deadline_goes_first_and_equal_ones_in_order_of_arrival() -> None:
     late, first, second = Entry(9.0), Entry(5.0), Entry(5.0)
-    batch, dropped = queue(late, first, second).take_batch(0.0, 2)
+    batch, dropped, _ = queue(late, first, second).take_batch(0.0, 2)
     assert batch == [first, second]
     assert not dropped
 
@@ -60,7 +61,7 @@ def test_nothing_overtakes_an_entry_of_its_key_that_does_not_fit() -> None:
 
 def test_entries_that_would_be_late_are_dropped_before_they_take_the_models_time() -> None:
     hopeless, possible, cancelled = Entry(10.05, 100), Entry(10.2, 100), Entry(10.01, finished=True)
-    batch, dropped = queue(hopeless, possible, cancelled).take_batch(10.0, 256)
+    batch, dropped, _ = queue(hopeless, possible, cancelled).take_batch(10.0, 256)
     assert batch == [possible]
     assert dropped == [hopeless]
 
@@ -83,23 +84,46 @@ def test_parts_of_a_large_call_lag_so_that_small_calls_get_between() -> None:
     assert list(waiting) == [parts[0], small, parts[1], parts[2]]
 
 
-def test_the_expected_wait_counts_what_goes_first() -> None:
-    waiting = queue(Entry(1.0, 100), Entry(2.0, 100), Entry(3.0, 100), Entry(4.0, 100))
-    assert waiting.seconds_before(0.5) == 0
-    assert waiting.seconds_before(2.5) == pytest.approx(0.2)
-    assert waiting.seconds_before(9.0) == pytest.approx(0.4)
-    assert len(waiting.take_batch(0.0, 200)[0]) == 1  # 100 agents take longer than a batch should
-    assert waiting.seconds_before(9.0) == pytest.approx(0.3)
+def test_a_higher_priority_goes_first() -> None:
+    late, urgent, important = Entry(9.0), Entry(1.0), Entry(9.0, priority=1)
+    assert list(queue(late, urgent, important)) == [important, urgent, late]
 
 
-def test_removed_entries_are_no_wait() -> None:
-    entry = Entry(1.0, 100)
-    waiting = queue(entry, Entry(2.0, 300))
+def test_removed_entries_leave() -> None:
+    entry, other = Entry(1.0), Entry(1.0)
+    waiting = queue(entry, other)
     waiting.remove(entry)
     waiting.remove(entry)
-    assert waiting.seconds_before(9.0) == pytest.approx(0.3)
+    assert list(waiting) == [other]
     waiting.clear()
-    assert waiting.seconds_before(9.0) == 0
+    assert len(waiting) == 0
+
+
+def test_batches_say_why_they_left() -> None:
+    few = [Entry(100.0, 2) for _ in range(3)]
+    assert queue(*few).take_batch(0.0, 8)[2] is Departure.EMPTY
+    assert queue(*few, Entry(100.0, key="other")).take_batch(0.0, 8)[2] is Departure.EMPTY
+    assert queue(*few).take_batch(0.0, 4)[2] is Departure.AGENTS
+    many = [Entry(100.0, MIN_BATCH_AGENTS) for _ in range(3)]
+    assert queue(*many).take_batch(0.0, 1000)[2] is Departure.TIME
+    assert queue(Entry(0.025, 20), Entry(9.0, 20)).take_batch(0.0, 1000)[2] is Departure.DEADLINE
+
+
+def test_a_batch_takes_nothing_that_would_make_its_first_entry_late() -> None:
+    urgent, others = Entry(10.035, 10), [Entry(20.0, 10) for _ in range(5)]
+    waiting = queue(urgent, *others)
+    assert waiting.take_batch(10.0, 1000)[0] == [urgent, *others[:2]]
+
+
+def test_time_after_the_forward_counts_for_the_deadline() -> None:
+    model = costs()
+    for _ in range(50):
+        model.measure_around(1, 0.0, after=0.1)
+    waiting: DeadlineQueue[Entry] = DeadlineQueue(model)
+    hopeless, possible = Entry(10.1, 10), Entry(10.12, 10)
+    for entry in (hopeless, possible):
+        waiting.put(entry)
+    assert waiting.take_batch(10.0, 256)[:2] == ([possible], [hopeless])
 
 
 def test_costs_are_learned_by_key() -> None:
@@ -126,7 +150,7 @@ def test_every_entry_leaves_once_in_a_batch_or_as_late(
     waiting = queue(*entries, rate=200.0)
     left: list[Entry] = []
     for _ in range(len(entries) + 1):
-        batch, late = waiting.take_batch(50.0, max_agents)
+        batch, late, _ = waiting.take_batch(50.0, max_agents)
         assert len({entry.key for entry in batch}) <= 1
         assert sum(entry.agents for entry in batch) <= max_agents or len(batch) == 1
         assert all(entry.deadline < 50.0 + entry.agents / 200.0 + 1.0 for entry in late)
@@ -135,6 +159,17 @@ def test_every_entry_leaves_once_in_a_batch_or_as_late(
             break
     assert len(waiting) == 0
     assert sorted(map(id, left)) == sorted(id(entry) for entry in entries if not entry.finished)
+
+
+def test_work_around_a_call_is_known_by_size() -> None:
+    model = costs()
+    assert model.around(8) == 0
+    model.measure_around(1, 0.01, 0.0)
+    assert model.around(500) == pytest.approx(0.01)  # a guess refuses nobody
+    model.measure_around(512, 0.512, 0.0)
+    assert model.around(512) == pytest.approx(0.512)
+    assert model.around(256) == pytest.approx(0.256)
+    assert model.work(512) == pytest.approx(0.512 + 0.512)
 
 
 def test_each_size_has_its_own_rate_and_others_that_of_the_nearest() -> None:
@@ -152,28 +187,6 @@ def test_each_size_has_its_own_rate_and_others_that_of_the_nearest() -> None:
 def test_a_wrong_estimate_cannot_refuse_for_ever() -> None:
     only = Entry(10.05, 100)
     waiting = queue(only, rate=1.0)
-    assert waiting.take_batch(10.0, 256) == ([only], [])
+    assert waiting.take_batch(10.0, 256)[:2] == ([only], [])
     past, possible = Entry(9.0, 100), Entry(10.05, 100)
-    assert queue(past, possible, rate=1.0).take_batch(10.0, 256) == ([possible], [past])
-
-
-def test_a_new_call_takes_as_long_as_those_before_it() -> None:
-    throughput = Throughput()
-    assert throughput.seconds_until(100.0) == 0  # nothing is known
-    for number in range(40):  # two at a time, one is answered every 10 ms
-        throughput.begin(10.0 + number, 0.01 * number)
-        if number:
-            throughput.end(9.0 + number, 0.01 * number + 0.005, finished=True)
-    assert throughput.seconds_until(100.0) == pytest.approx(0.02, rel=0.1)
-    assert throughput.seconds_until(20.0) == pytest.approx(0.01, rel=0.1)  # it goes before the other
-    throughput.end(49.0, 0.5, finished=False)
-    assert throughput.seconds_until(100.0) == 0  # nothing waits
-
-
-def test_time_without_calls_is_no_time_of_an_answer() -> None:
-    throughput = Throughput()
-    for start in (0.0, 100.0):
-        throughput.begin(start + 1, start)
-        throughput.end(start + 1, start + 0.2, finished=True)
-    throughput.begin(201.0, 200.0)
-    assert throughput.seconds_until(202.0) == pytest.approx(0.4)
+    assert queue(past, possible, rate=1.0).take_batch(10.0, 256)[:2] == ([possible], [past])

@@ -17,7 +17,17 @@ from service.transports.intake import SMALL_BODY
 from service.transports.rest.connections import MAX_HEADER_BYTES
 from tests.service.fakes import FakeForecaster
 from tests.service.requests import make_request
-from tests.service.servers import PREDICT, TRANSPORTS, CallError, call_grpc, call_rest, count, running, until
+from tests.service.servers import (
+    PREDICT,
+    TRANSPORTS,
+    CallError,
+    call_grpc,
+    call_rest,
+    count,
+    running,
+    until,
+    until_waiting,
+)
 
 started = functools.partial(running, max_batch_agents=4)  # which shortens the warm-up
 LARGE = SMALL_BODY + 1
@@ -275,3 +285,35 @@ def test_a_full_request_fits_into_the_budget() -> None:
     assert (
         Settings(max_request_bytes=3 * 2**20, max_intake_bytes=4 * 2**20).max_large_intake_bytes == 3 * 2**20
     )
+
+
+async def test_a_call_over_grpc_is_refused_before_its_request_is_read() -> None:
+    fake = FakeForecaster()
+    async with started(fake, max_agents=4, max_queue_agents=4) as server:
+        fake.free.clear()
+        accepted = [asyncio.create_task(call_grpc(server, make_request(4)))]
+        await until(fake.entered.is_set)
+        accepted.append(asyncio.create_task(call_grpc(server, make_request(4))))
+        await until_waiting(server, 4)
+        async with connected(server.grpc_address, [grpc_call(1000, body=b"the rest never comes")]):
+            await until(lambda: count(server, "grpc", "Predict", "RESOURCE_EXHAUSTED") == 1)
+        assert refused(server, "queue_full") == 1
+        fake.free.set()
+        await asyncio.gather(*accepted)
+        await check_released(server)
+
+
+async def test_responses_that_are_not_read_give_their_places_free() -> None:
+    async with started(write_timeout=0.3, max_concurrent_calls=4) as server:
+        request = make_request(20)
+        request.options.samples = 2000  # more than the buffers of a connection hold
+        body = request.SerializeToString()
+        unread = [grpc_call(len(body), body=body)] * 2
+        async with connected(server.http_address, [post(len(body), body=body)] * 2) as connections:
+            async with connected(server.grpc_address, unread):
+                await until(lambda: count(server, "rest", "Predict", "OK") == 2)
+                await until(lambda: count(server, "grpc", "Predict", "OK") == 2)
+                await check_released(server)
+                await check_answers(server)
+            for connection in connections:
+                assert await ended(connection)

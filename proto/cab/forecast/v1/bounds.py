@@ -6,6 +6,8 @@ share one definition.
 
 MAX_ID_LENGTH = 128
 """Characters of an agent's or a scene's id."""
+MAX_PRIORITY = 7
+"""Highest priority of a call."""
 STEP_SECONDS = 0.5
 """Seconds between the steps of a forecast."""
 PATCH_PIXELS = 100

@@ -504,6 +504,7 @@ class PredictOptions(_message.Message):
     HISTORY_FIELD_NUMBER: _builtins.int
     CONSISTENCY_FIELD_NUMBER: _builtins.int
     MERGE_FIELD_NUMBER: _builtins.int
+    PRIORITY_FIELD_NUMBER: _builtins.int
     max_modes: _builtins.int
     """Return the most likely modes only, at most this many; remaining_weight is what the rest weigh.
     0 returns all. With merge it counts merged modes.
@@ -530,6 +531,10 @@ class PredictOptions(_message.Message):
     for its group; covariances are the group's second moment about those means. mode_ids are the kept modes'
     numbers. Samples are drawn, and forecasts remembered, as without it. Default false: all modes.
     """
+    priority: _builtins.int
+    """0 to 7. Under overload calls of a higher priority are forecast first and refused last; equal ones go by
+    deadline. Default 0.
+    """
     def __init__(
         self,
         *,
@@ -542,10 +547,11 @@ class PredictOptions(_message.Message):
         history: Global___HistorySource.ValueType = ...,
         consistency: _builtins.bool = ...,
         merge: _builtins.bool = ...,
+        priority: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["_horizon", b"_horizon", "_seed", b"_seed", "horizon", b"horizon", "seed", b"seed"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_horizon", b"_horizon", "_seed", b"_seed", "consistency", b"consistency", "context", b"context", "history", b"history", "horizon", b"horizon", "max_modes", b"max_modes", "merge", b"merge", "samples", b"samples", "seed", b"seed", "strict", b"strict"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_horizon", b"_horizon", "_seed", b"_seed", "consistency", b"consistency", "context", b"context", "history", b"history", "horizon", b"horizon", "max_modes", b"max_modes", "merge", b"merge", "priority", b"priority", "samples", b"samples", "seed", b"seed", "strict", b"strict"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__horizon: _TypeAlias = _typing.Literal["horizon"]  # noqa: Y015
     _WhichOneofArgType__horizon: _TypeAlias = _typing.Literal["_horizon", b"_horizon"]  # noqa: Y015
