@@ -73,9 +73,9 @@ def call(deadline: float, agents: int, priority: int = 0) -> Call:
 async def test_a_call_that_would_be_late_is_refused() -> None:
     admission = make()
     with Calls(admission) as calls:
-        calls.begin(200, seconds=0.5)
+        calls.begin(200, seconds=0.45)
         with pytest.raises(Overloaded) as caught:  # as large as the call before
-            admission.admit(now() + 0.51)
+            admission.admit(now() + 0.46)
         assert caught.value.retry_after == pytest.approx(0.2, rel=0.2)
         assert refused(admission, "late") == 1
         assert admission.admit(now() + 1.0)
@@ -109,14 +109,14 @@ async def test_a_size_that_is_known_may_refuse_what_was_admitted() -> None:
 async def test_a_new_call_is_expected_to_be_as_small_as_the_last_ones() -> None:
     admission = make()
     with Calls(admission) as calls:
-        calls.begin(200, seconds=0.5)
+        calls.begin(200, seconds=0.45)
         with pytest.raises(Overloaded):
-            admission.admit(now() + 0.51)
+            admission.admit(now() + 0.46)
         calls.begin(1, seconds=1e3)
-        assert admission.admit(now() + 0.51)
+        assert admission.admit(now() + 0.46)
         for _ in range(32):
             calls.begin(20, seconds=1e4)
-        assert admission.admit(now() + 0.51)
+        assert admission.admit(now() + 0.46)
 
 
 async def test_a_full_queue_refuses() -> None:
