@@ -22,6 +22,12 @@ NAME = "fake@2.0.0"
 """The shadow: another version of the default model."""
 
 
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let calls wait for longer than a busy machine makes them."""
+    monkeypatch.setattr("service.predict.shadow._MAX_AGE", 60.0)
+
+
 def pair() -> tuple[FakeForecaster, FakeForecaster]:
     """Return the default model, pinned to the first version by the settings, and the shadow."""
     return FakeForecaster(modes=4), FakeForecaster(version="2.0.0", modes=6)
