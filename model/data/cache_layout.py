@@ -144,7 +144,7 @@ def pair_layout(key: CacheKey) -> Layout:
 
 def in_agent_frame(config: AnyNetworkConfig) -> bool:
     """Return whether a network's features are in the agents' own frames."""
-    return isinstance(config, NetworkConfig) and config.frame is Frame.AGENT
+    return config.frame is Frame.AGENT
 
 
 def draws(config: AnyNetworkConfig) -> bool:

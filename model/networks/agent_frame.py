@@ -28,7 +28,7 @@ from model.features.agent_features import (
 )
 from model.features.standardization import STATE_SIZE
 from model.forecaster import Context, Features
-from model.networks.config import NetworkConfig
+from model.networks.config import BlindContext, NetworkConfig
 from model.networks.dynamics import Positions
 from model.networks.recurrent import HistoryLSTM
 from model.scenes.raster import FAR, PatchGeometry
@@ -92,13 +92,18 @@ class Modes(NamedTuple):
     path: Path
     sigma: Tensor
     """[N, K, T, 2], m, along and across the path."""
+    controls: Tensor
+    """[N, K, T, 2], heading rate (rad/s) and acceleration (m/s²) of the path."""
+    start: Tensor
+    """[N, K, 2], heading (rad) and speed (m/s) at which the path begins."""
 
 
 class AgentFrameNetwork(nn.Module):
     """The network of vehicles in their own frame, with a full and a blind context.
 
     A blind forecast is the same network with a null context (CAB, Ben-Younes et al. 2022, section 3): an
-    unknown map and no neighbours, as in a request without map and neighbours.
+    unknown map and no neighbours, as in a request without map and neighbours. With ``blind = "own"`` it is
+    that of ``blind_network``, which sees the history alone.
     """
 
     width: Tensor
@@ -140,6 +145,16 @@ class AgentFrameNetwork(nn.Module):
                 head.weight.mul_(0.1)
         self.register_buffer("width", torch.ones(STEPS))
         self.register_buffer("temperature", torch.ones(()))
+        alone = {"neighbor_types": (), "uses_map": False, "far_map": False, "blind": BlindContext.NONE}
+        self.blind_network = (
+            AgentFrameNetwork(config.model_copy(update=alone)) if config.blind is BlindContext.OWN else None
+        )
+
+    def branch(self, context: Context) -> "tuple[AgentFrameNetwork, Context]":
+        """Return the network that forecasts in a context, and the context that it is given."""
+        if context is Context.BLIND and self.blind_network is not None:
+            return self.blind_network, Context.FULL
+        return self, context
 
     @property
     def variance_floor(self) -> Tensor:
@@ -181,7 +196,8 @@ class AgentFrameNetwork(nn.Module):
         usual = self.width.new_tensor(_USUAL_LOG_SIGMA)
         sigma = (usual + self.sigma(refined).unflatten(-1, (STEPS, 2)).clamp(-4, 4)).exp()
         logits = self.logits(refined)[..., 0] + self.mode_logits(encoding.relu())
-        return Modes(logits, proposal, path, sigma)
+        start = torch.stack([heading, speed], dim=-1)
+        return Modes(logits, proposal, path, sigma, controls * scale, start)
 
     def covariance(self, modes: Modes) -> Tensor:
         """Return the covariances in the agent's frame, at least the floor: [N, K, T, 2, 2], m²."""
@@ -203,14 +219,15 @@ class AgentFrameNetwork(nn.Module):
         """
         if steps > STEPS:
             raise ValueError(f"this network forecasts {STEPS} steps, not {steps}")
-        modes = self.decode(self.encode(features, context), features, context)
+        network, context = self.branch(context)
+        modes = network.decode(network.encode(features, context), features, context)
         mean = torch.stack([modes.path.x, modes.path.y], dim=-1)[:, :, :steps]
-        covariance = self.covariance(modes)[:, :, :steps]
+        covariance = network.covariance(modes)[:, :, :steps]
         cos, sin = (part.to(mean.dtype) for part in (features["heading"].cos(), features["heading"].sin()))
         turn = torch.stack([cos, -sin, sin, cos], dim=-1).unflatten(-1, (2, 2))[:, None, None]
         mean = (turn @ mean[..., None])[..., 0]
         covariance = turn @ covariance @ turn.transpose(-1, -2)
-        return F.log_softmax(modes.logits / self.temperature, dim=-1), Positions(mean, covariance)
+        return F.log_softmax(modes.logits / network.temperature, dim=-1), Positions(mean, covariance)
 
     def _read(self, path: Path, features: Features, context: Context) -> Tensor:
         """Return the encoding of map and neighbours at every other step of each mode: [N, K, T/2, 32].

@@ -23,7 +23,8 @@ class BlindContext(StrEnum):
     NULL = "null"
     """Blind forecasts by the same network, with a null context (CAB, section 3)."""
     OWN = "own"
-    """A second latent and decoder on the history encoding (released Reweight and RUBiZ)."""
+    """A second latent and decoder on the history encoding (released Reweight and RUBiZ); in the agent's frame
+    a second network that sees the history alone, so that it takes no capacity from the first."""
 
 
 class NetworkConfig(BaseModel):
@@ -69,10 +70,8 @@ class NetworkConfig(BaseModel):
             return self
         if self.agent_types != (AgentType.VEHICLE,):
             raise ValueError("frame: only vehicles are forecast in the agent's frame")
-        if self.blind is BlindContext.OWN or self.max_control_sigma is not None:
-            raise ValueError(
-                "frame: a network of the agent's frame has neither own blind branch nor max_control_sigma"
-            )
+        if self.max_control_sigma is not None:
+            raise ValueError("frame: a network of the agent's frame has no max_control_sigma")
         return self
 
     @property
@@ -105,6 +104,11 @@ class CoverNetConfig(BaseModel):
     neighbor_types: tuple[AgentType, ...] = (AgentType.VEHICLE, AgentType.PEDESTRIAN)
     """Types that are drawn into the picture around the agent; empty: none."""
     uses_map: bool = True
+    frame: Frame = Frame.GROUND
+    """Frame of the features; checkpoints without this field use the ground frame. Pictures and trajectories
+    are in the agent's frame either way."""
+    far_map: bool = False
+    """True if a picture of the far map patch is seen, too (agent frame only)."""
     epsilon: float = Field(default=2.0, gt=0)
     """ε, m: maximum distance of each training trajectory from its nearest member of the set, at any step."""
     steps: int = Field(default=12, ge=1, le=120)
@@ -118,6 +122,8 @@ class CoverNetConfig(BaseModel):
     def _makes_sense(self) -> "CoverNetConfig":
         if not (self.uses_map or self.neighbor_types):
             raise ValueError("there is nothing in the picture: neither map nor neighbours")
+        if self.far_map and self.frame is Frame.GROUND:
+            raise ValueError("far_map: networks of the ground frame look at the near patch only")
         if 0 < self.members < self.modes:
             raise ValueError(f"{self.modes} modes cannot be of {self.members} members")
         for kind in self.neighbor_types:
@@ -128,7 +134,8 @@ class CoverNetConfig(BaseModel):
     @property
     def features(self) -> FeatureSpec:
         """The features that the network takes."""
-        return FeatureSpec(Frame.GROUND, self.neighbor_types, self.uses_map, neighbor_boxes=True)
+        boxes = self.frame is Frame.GROUND
+        return FeatureSpec(self.frame, self.neighbor_types, self.uses_map, self.far_map, neighbor_boxes=boxes)
 
     def looks_at_map(self, agent_type: AgentType) -> bool:
         """Return whether forecasts of agents of that type depend on the map."""

@@ -86,9 +86,7 @@ class NetworkForecaster(Forecaster, Generic[SomeNetworks]):
             return False
         try:
             self._graphs = {
-                (agent_type, context): GraphForward(
-                    self.networks.of(agent_type), self.config, context, threads
-                )
+                (agent_type, context): GraphForward(self.networks.of(agent_type), context, threads)
                 for agent_type in self.info.agent_types
                 for context in self.info.contexts
             }
@@ -106,9 +104,7 @@ class NetworkForecaster(Forecaster, Generic[SomeNetworks]):
 
     def looks_at_far_map(self, agent_type: AgentType) -> bool:
         """Return whether agents of that type see the far map; only vehicles in the agent's frame can."""
-        return (
-            self.looks_at_map(agent_type) and isinstance(self.config, NetworkConfig) and self.config.far_map
-        )
+        return self.looks_at_map(agent_type) and self.config.far_map
 
     def prepare(self, scene: Scene, targets: Ints, context: Context = Context.FULL) -> Features:
         return complete([self.view(scene, targets, context)])

@@ -14,11 +14,10 @@ import torch
 from torch import nn
 
 from model.features.agent_features import NEIGHBOR_FEATURES, NEIGHBORS
-from model.features.spec import Frame
 from model.features.standardization import STATE_SIZE
 from model.forecaster import Context, Features
-from model.networks.agent_frame import STEPS
-from model.networks.config import AnyNetworkConfig, NetworkConfig
+from model.networks.agent_frame import STEPS, AgentFrameNetwork
+from model.networks.config import NetworkConfig
 from model.networks.dynamics import Positions
 from model.scenes.raster import FAR, NEAR
 from model.scenes.scene import AgentType
@@ -73,7 +72,6 @@ class GraphForward:
 
     Args:
         network: the network, whose parameters it runs with; the memory is shared.
-        config: its architecture.
         context: full or blind.
         threads: threads of one forward; None: all cores.
 
@@ -81,16 +79,15 @@ class GraphForward:
         LookupError: there is no graph of that architecture.
     """
 
-    def __init__(
-        self, network: nn.Module, config: AnyNetworkConfig, context: Context, threads: int | None
-    ) -> None:
-        if not isinstance(config, NetworkConfig) or config.frame is not Frame.AGENT:
+    def __init__(self, network: nn.Module, context: Context, threads: int | None) -> None:
+        if not isinstance(network, AgentFrameNetwork):
             raise LookupError("only networks of the agent's frame have graphs")
-        file = GRAPHS / graph_name(config, context)
-        if not file.is_file():
-            raise LookupError(f"there is no graph {graph_name(config, context)}")
         self._context = context
-        self._inputs = tuple(graph_inputs(config, context))
+        network, seen = network.branch(context)
+        file = GRAPHS / graph_name(network.config, seen)
+        if not file.is_file():
+            raise LookupError(f"there is no graph {file.name}")
+        self._inputs = tuple(graph_inputs(network.config, seen))
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads or 0
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")

@@ -156,9 +156,11 @@ def _nll_by_step(
 
 @torch.no_grad()
 def calibrate_by_horizon(network: AgentFrameNetwork, calibration: HorizonCalibration) -> None:
-    """Apply a calibration to a network's buffers."""
-    network.width.mul_(torch.tensor(calibration.widths, device=network.width.device))
-    network.temperature.mul_(calibration.temperature)
+    """Apply a calibration to a network's buffers, and to those of its own blind branch, if it has one."""
+    for one in (network, network.blind_network):
+        if one is not None:
+            one.width.mul_(torch.tensor(calibration.widths, device=one.width.device))
+            one.temperature.mul_(calibration.temperature)
 
 
 @torch.no_grad()

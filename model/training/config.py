@@ -40,9 +40,6 @@ class Method(StrEnum):
 BLIND = frozenset({Method.CAB, Method.REWEIGHT, Method.RUBIZ})
 """Methods whose objectives compare with a blind forecast."""
 
-_IN_AGENT_FRAME = frozenset({Method.CAB, Method.TRAJECTRON, Method.TRAJECTRON_NO_CONTEXT})
-"""Methods with networks of the agent's frame."""
-
 
 class Precision(StrEnum):
     """Precision of the convolutions and of the unrolled decoder in training.
@@ -235,10 +232,9 @@ class TrainingConfig(BaseModel):
                     "agent's frame"
                 )
             return self
-        if self.method not in _IN_AGENT_FRAME:
-            raise ValueError(f"frame: {self.method.value} cannot be trained in the agent's frame")
-        no_neighbors = isinstance(self.network, NetworkConfig) and not self.network.neighbor_types
-        if self.stopped_vehicles and no_neighbors:
+        if isinstance(self.network, CoverNetConfig) and self.mixture != MixtureWeights():
+            raise ValueError("mixture: covernet's objective has no such terms")
+        if self.stopped_vehicles and not self.network.neighbor_types:
             raise ValueError("stopped_vehicles: the network sees no neighbours")
         if self.rotate:
             raise ValueError("rotate: in the agent's frame a rotated scene is the same scene")
@@ -253,7 +249,7 @@ class TrainingConfig(BaseModel):
     @property
     def in_agent_frame(self) -> bool:
         """True if the network sees and forecasts in the agent's frame."""
-        return isinstance(self.network, NetworkConfig) and self.network.frame is Frame.AGENT
+        return self.network.frame is Frame.AGENT
 
     @property
     def displacement_start(self) -> int:
@@ -262,7 +258,8 @@ class TrainingConfig(BaseModel):
 
     def toml(self) -> str:
         """Return the settings as a file for ``load_config``, without those of the command line."""
-        left_out = {"method", "start"} if self.in_agent_frame else {"method", "start", "mixture"}
+        uses_mixture = self.in_agent_frame and isinstance(self.network, NetworkConfig)
+        left_out = {"method", "start"} if uses_mixture else {"method", "start", "mixture"}
         values = self.model_dump(mode="json", exclude=left_out, exclude_none=True)
         tables = {name: values.pop(name) for name in ("mixture", "network") if name in values}
         lines = _toml_lines(values)

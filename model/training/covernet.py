@@ -11,7 +11,7 @@ from model.networks.covernet import present_heading, turned
 from model.networks.forecaster import CoverNetworks
 from model.scenes.scene import AgentType
 from model.training.config import TrainingConfig, TrainingError
-from model.training.learner import Batch, DescentLearner
+from model.training.learner import Batch, DescentLearner, perturbed
 from model.training.objectives import LossWeights
 from model.training.trajectory_set import make_trajectory_set, summed_distances
 
@@ -50,14 +50,14 @@ class CoverNetLearner(DescentLearner):
         self.network.trajectory_set.copy_(trajectories.members)
         self.network.variance.copy_(trajectories.variance)
         super().__init__(config, networks.to(device))
+        self._config = config
 
     def step(self, batches: Sequence[Batch], weights: LossWeights, rate: float) -> dict[str, Tensor]:
-        (batch,) = batches
+        features, path = self._shown(*batches)
         with torch.no_grad():
-            path = turned(batch.future, -present_heading(batch.features))
             distances = summed_distances(path, self.network.trajectory_set)
             nearest = distances.argmin(dim=1)
-        scores = self.network.scores(batch.features)
+        scores = self.network.scores(features)
         loss = F.cross_entropy(scores, nearest)
         terms = _accuracies(scores.detach(), nearest)
         if weights.displacement:
@@ -66,6 +66,12 @@ class CoverNetLearner(DescentLearner):
             terms["displacement"] = displaced.detach()
         self.descend(loss, rate)
         return {"loss": loss.detach(), **terms}
+
+    def _shown(self, batch: Batch) -> Batch:
+        """Return features as the network is shown them, and the future in the agents' frames."""
+        if self._config.in_agent_frame:
+            return perturbed(batch, self._config)
+        return Batch(batch.features, turned(batch.future, -present_heading(batch.features)))
 
 
 def _accuracies(scores: Tensor, nearest: Tensor) -> dict[str, Tensor]:

@@ -18,7 +18,7 @@ from model.networks.decoder import ModeDecoder
 from model.networks.encoders import MapEncoder
 from model.networks.forecaster import CvaeNetworks, Networks
 from model.scenes.scene import AgentType
-from model.training.config import Method, TrainingConfig
+from model.training.config import TrainingConfig
 from model.training.mixture_objective import mixture_objective
 from model.training.objectives import OBJECTIVES, Loss, LossWeights
 from model.training.processes import average_gradients
@@ -81,14 +81,15 @@ class DescentLearner(Learner):
     Args:
         config: settings of the run.
         networks: the networks, on their device.
+        map_rate_factor: factor on the learning rate of the map encoders.
     """
 
-    def __init__(self, config: TrainingConfig, networks: Networks[Any]) -> None:
+    def __init__(self, config: TrainingConfig, networks: Networks[Any], map_rate_factor: float = 1.0) -> None:
         super().__init__(networks)
         set_precision(networks, config.precision.dtype_on(next(networks.parameters()).device))
         scale_dropout(networks, config.dropout_factor)
         self.optimizer = torch.optim.AdamW(
-            self._groups(), lr=config.learning_rate, weight_decay=config.weight_decay
+            _groups(networks, map_rate_factor), lr=config.learning_rate, weight_decay=config.weight_decay
         )
         self._clip = config.gradient_clip
         self._batch_size = config.batch_size
@@ -111,10 +112,6 @@ class DescentLearner(Learner):
         torch.nn.utils.clip_grad_norm_(self.networks.parameters(), self._clip)
         self.optimizer.step()
 
-    def _groups(self) -> list[dict[str, object]]:
-        """Return the optimiser's parameter groups; ``rate_factor`` multiplies a group's learning rate."""
-        return [{"params": list(self.networks.parameters())}]
-
 
 class CvaeLearner(DescentLearner):
     """A CVAE under its method's objective (``model.training.objectives``).
@@ -122,12 +119,13 @@ class CvaeLearner(DescentLearner):
     Args:
         config: settings of the run.
         device: device of the networks.
+        map_rate_factor: factor on the learning rate of the map encoder.
     """
 
-    def __init__(self, config: TrainingConfig, device: torch.device) -> None:
+    def __init__(self, config: TrainingConfig, device: torch.device, map_rate_factor: float = 1.0) -> None:
         assert isinstance(config.network, NetworkConfig)  # noqa: S101 (for the type checker; the method's)
         networks = CvaeNetworks(config.network).to(device)
-        super().__init__(config, networks)
+        super().__init__(config, networks, map_rate_factor)
         network = networks.of(AgentType.VEHICLE)
         assert isinstance(network, AgentNetwork)  # noqa: S101 (likewise)
         self.network = network
@@ -159,23 +157,40 @@ class AgentFrameLearner(DescentLearner):
 
     def step(self, batches: Sequence[Batch], weights: LossWeights, rate: float) -> dict[str, Tensor]:
         (batch,) = batches
-        features, future = self._perturbed(batch)
-        contrast = self._config.method is Method.CAB
-        loss = mixture_objective(self.network, features, future, self._config.mixture, contrast)
+        features, future = perturbed(batch, self._config)
+        loss = mixture_objective(self.network, features, future, self._config.mixture, self._config.method)
         self.descend(loss.value, rate)
         return logged(loss)
 
-    def _perturbed(self, batch: Batch) -> tuple[Features, Tensor]:
-        """Return perturbed features, maps unpacked, and the future in the agents' frames."""
-        config = self._config
-        future = turned(batch.future, -batch.features["heading"].to(batch.future.dtype))
-        features = batch.features
-        if config.stopped_vehicles:
-            features = insert_stopped_vehicles(features, future)
-        features = dict(drop_context(features) if config.context_dropout else features)
-        for name in features.keys() & {"map", "far_map"}:
-            features[name] = unpack_patches(features[name])
-        return jitter(features, future) if config.jitter else (features, future)
+
+def perturbed(batch: Batch, config: TrainingConfig) -> Batch:
+    """Return a batch of the agent's frame as a network is shown it.
+
+    Args:
+        batch: features in the agents' frames, maps packed, and the future in the ground frame.
+        config: settings that name the perturbations.
+
+    Returns:
+        Features, perturbed, with maps unpacked, and the future in the agents' frames.
+    """
+    future = turned(batch.future, -batch.features["heading"].to(batch.future.dtype))
+    features = batch.features
+    if config.stopped_vehicles:
+        features = insert_stopped_vehicles(features, future)
+    features = dict(drop_context(features) if config.context_dropout else features)
+    for name in features.keys() & {"map", "far_map"}:
+        features[name] = unpack_patches(features[name])
+    return Batch(*(jitter(features, future) if config.jitter else (features, future)))
+
+
+def _groups(networks: nn.Module, map_rate_factor: float) -> list[dict[str, object]]:
+    """Return the optimiser's parameter groups; ``rate_factor`` multiplies a group's learning rate."""
+    named = list(networks.named_parameters())
+    of_map = [parameter for name, parameter in named if ".map_encoder." in name]
+    if map_rate_factor == 1.0 or not of_map:
+        return [{"params": [parameter for _, parameter in named]}]
+    others = [parameter for name, parameter in named if ".map_encoder." not in name]
+    return [{"params": others}, {"params": of_map, "rate_factor": map_rate_factor}]
 
 
 def logged(loss: Loss) -> dict[str, Tensor]:

@@ -3,8 +3,9 @@
 Its terms were chosen by experiment (``docs/experiments.md``): the likelihood of the mixture with weights
 p(z | x), the distance of the nearest mode (winner takes all: multiple choice learning, Guzman-Rivera et al.
 2012, as in MTP and MultiPath), the classification of the nearest modes, and the distance from the truth
-expected under the probabilities, which makes the likeliest mode a near one. CAB adds the same terms for its
-blind forecast and its KL term, ``objectives.cab_kl`` (Ben-Younes et al. 2022, section 3.3).
+expected under the probabilities, which makes the likeliest mode a near one. Methods with a blind forecast add
+the same terms for it, and their own one: CAB the KL term ``objectives.cab_kl``, Reweight a larger weight of
+what the blind forecast misses, RUBiZ the likelihood under fused latents (Ben-Younes et al. 2022, section 3).
 """
 
 import math
@@ -18,8 +19,8 @@ from model.features.agent_features import NEIGHBOR_VELOCITY_SCALE
 from model.forecaster import Context, Features
 from model.networks.agent_frame import AgentFrameNetwork, Modes, Path, drives_through, read_patch
 from model.scenes.raster import FAR
-from model.training.config import MixtureWeights
-from model.training.objectives import Loss, cab_kl
+from model.training.config import BLIND, Method, MixtureWeights
+from model.training.objectives import RUBIZ_FULL, Loss, cab_kl, fused_log_weights
 
 _LEFT = 0.2
 """A neighbour has left if the true path overlaps its place by more than this (``drives_through``)."""
@@ -32,43 +33,66 @@ class _Terms(NamedTuple):
     named: dict[str, Tensor]
     log_weights: Tensor
     """[N, K]."""
+    density: Tensor
+    """[N, K, T], log-density of the true position under each mode."""
+    log_likelihood: Tensor
+    """[N], nats, of a step, averaged over the steps."""
 
 
 def mixture_objective(
-    network: AgentFrameNetwork, features: Features, future: Tensor, weights: MixtureWeights, contrast: bool
+    network: AgentFrameNetwork, features: Features, future: Tensor, weights: MixtureWeights, method: Method
 ) -> Loss:
     """Return the loss of a batch.
+
+    Methods with a blind forecast add the terms of that forecast and their own term: CAB its KL term
+    (``objectives.cab_kl``), Reweight and RUBiZ those of ``objectives.reweight`` and ``objectives.rubiz``.
 
     Args:
         network: the network, in training mode.
         features: features of N agents, full context.
         future: [N, T, 2], m, in the agents' frames, relative to now.
         weights: weights of the terms.
-        contrast: whether to add CAB's terms: those of the blind forecast, and ``cab_kl``.
+        method: the method; HalentNet's adversarial terms are not part of this loss.
     """
     full = _terms(network, features, future, weights, Context.FULL)
-    if not contrast:
+    if method not in BLIND:
         return Loss(full.value, full.named)
     some = slice(0, max(1, round(weights.blind_share * len(future))))
     part = {name: values[some] for name, values in features.items()}
     blind = _terms(network, part, future[some], weights, Context.BLIND)
-    kl = cab_kl(full.log_weights[some], blind.log_weights)
-    value = full.value + weights.blind * blind.value - weights.blind_kl * kl
+    value = full.value + weights.blind * blind.value
+    if method is Method.CAB:
+        kl = cab_kl(full.log_weights[some], blind.log_weights)
+        value, own = value - weights.blind_kl * kl, {"kl_full_blind": kl}
+    elif method is Method.REWEIGHT:
+        share = torch.sigmoid(-blind.log_likelihood).detach()
+        value = value - weights.nll * (share * full.log_likelihood[some]).mean()
+        own = {"share": share.mean()}
+    else:
+        # Near-uniform probabilities of the fused latent would pull all modes together by the expected
+        # distance, so its likelihood alone counts
+        fused = fused_log_weights(full.log_weights[some], blind.log_weights)
+        fused_nll = -torch.logsumexp(fused[..., None] + full.density[some], dim=1).mean()
+        own_nll = -full.log_likelihood.mean()
+        value = value + weights.nll * (fused_nll - (1 - RUBIZ_FULL) * own_nll)
+        own = {"nll_fused": fused_nll}
     named = {
         f"{name}_{which}": term
         for which, one in (("full", full), ("blind", blind))
         for name, term in one.named.items()
     }
-    return Loss(value, named | {"kl_full_blind": kl.detach()})
+    return Loss(value, named | {name: term.detach() for name, term in own.items()})
 
 
 def _terms(
     network: AgentFrameNetwork, features: Features, future: Tensor, weights: MixtureWeights, context: Context
 ) -> _Terms:
-    modes = network.decode(network.encode(features, context), features, context)
+    branch, seen = network.branch(context)
+    modes = branch.decode(branch.encode(features, seen), features, seen)
     log_weights = F.log_softmax(modes.logits, dim=-1)
-    density = step_log_density(network, modes, future)
-    nll = -torch.logsumexp(log_weights[..., None] + density, dim=1).mean()
+    density = step_log_density(branch, modes, future)
+    log_likelihood = torch.logsumexp(log_weights[..., None] + density, dim=1).mean(dim=-1)
+    nll = -log_likelihood.mean()
     distance, proposed = _distances(modes.path, future), _distances(modes.proposal, future)
     mean_distance = distance.mean(dim=-1)
     # The last step weighs more: modes that differ only there are different modes
@@ -115,7 +139,8 @@ def _terms(
         collision = (log_weights.exp() * met).sum(dim=1).mean()
         value = value + weights.collision * collision
         named["collision"] = collision
-    return _Terms(value, {name: term.detach() for name, term in named.items()}, log_weights)
+    named = {name: term.detach() for name, term in named.items()}
+    return _Terms(value, named, log_weights, density, log_likelihood)
 
 
 def _meets_standing(path: Path, future: Tensor, neighbors: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from model.forecaster import Context, Features
@@ -108,6 +109,16 @@ def rubiz(network: AgentNetwork, features: Features, future: Tensor, weights: Lo
     return Loss(
         value, {key: term for name, bound in bounds.items() for key, term in bound.named(name).items()}
     )
+
+
+def fused_log_weights(full: Tensor, blind: Tensor) -> Tensor:
+    """Return log-probabilities of RUBiZ's fused latents: [N, K].
+
+    Args:
+        full: [N, K], log p(z | x).
+        blind: [N, K], log p(z | blind x).
+    """
+    return F.log_softmax(full.sigmoid() * blind.sigmoid(), dim=-1)
 
 
 def fused_terms(full: ContextTerms, blind: ContextTerms) -> ContextTerms:

@@ -182,3 +182,18 @@ def test_a_map_far_ahead_matters_and_one_without_far_map_has_no_encoder_for_it(
     assert (one.path.x - other.path.x).abs().max() > 1e-3
     near_only = AgentFrameNetwork(NetworkConfig(frame=Frame.AGENT))
     assert not any("far_map" in name for name in near_only.state_dict())
+
+
+def test_an_own_blind_branch_sees_the_history_alone() -> None:
+    torch.manual_seed(0)
+    network = AgentFrameNetwork(CONFIG.model_copy(update={"blind": BlindContext.OWN})).eval()
+    features = features_in_agent_frame(4)
+    alone = {name: features[name] for name in ("origin", "heading", "speed", "history", "first")}
+    with torch.no_grad():
+        full, _ = network(features, Context.FULL, STEPS)
+        weights, positions = network(alone, Context.BLIND, STEPS)
+        assert network.blind_network is not None
+        expected, places = network.blind_network(alone, Context.FULL, STEPS)
+    assert torch.equal(weights, expected)
+    assert torch.equal(positions.mean, places.mean)
+    assert (full - weights).abs().max() > 1e-3

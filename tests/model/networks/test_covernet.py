@@ -9,11 +9,13 @@ import torch
 from torch import Tensor
 
 from model.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from model.features.spec import Frame
 from model.forecaster import Context, join
 from model.geometry import rotate, wrap_angle
 from model.networks.config import CoverNetConfig
-from model.networks.covernet import CoverNet
+from model.networks.covernet import CoverNet, boxes
 from model.networks.forecaster import CoverNetForecaster, CoverNetworks
+from model.networks.rasterize_boxes import rasterize_boxes
 from model.registry import Registry
 from model.scenes.scene import AgentType, Scene
 from tests.model.checkpoints import info
@@ -110,6 +112,29 @@ def test_it_sees_map_neighbours_and_its_own_motion(model: CoverNetForecaster) ->
     boxes = model.prepare(base, seen)
     empty = boxes | {"neighbor_boxes": torch.zeros_like(boxes["neighbor_boxes"])}
     assert (network.scores(boxes) - network.scores(empty)).abs().max() > 1e-5
+
+
+def test_in_the_agents_frame_it_sees_the_far_map_and_the_same_boxes() -> None:
+    config = CoverNetConfig(members=MEMBERS, frame=Frame.AGENT, far_map=True)
+    model = CoverNetForecaster(info(config), config, tensors(config))
+    assert model.looks_at_far_map(AgentType.VEHICLE)
+    base = scene()
+    features = model.prepare(base, VEHICLES)
+    network = model.networks.of(AgentType.VEHICLE)
+    plain = network.scores(features)
+    for name in ("far_map", "map", "neighbors"):
+        without = features | {name: torch.zeros_like(features[name])}
+        assert (network.scores(without) - plain).abs().max() > 1e-5, name
+    # The same agents as boxes of the ground frame's features
+    drawn = CoverNetForecaster(info(CONFIG), CONFIG, tensors()).prepare(base, VEHICLES)
+    torch.testing.assert_close(
+        rasterize_boxes(boxes(features)), rasterize_boxes(boxes(drawn)), atol=1e-4, rtol=1e-4
+    )
+    headings = base.states.heading[VEHICLES, -1]
+    likeliest = network.trajectory_set[plain.argmax(dim=1)].double().numpy()
+    np.testing.assert_allclose(
+        model(base, VEHICLES).means[:, 0].numpy(), rotate(likeliest, headings[:, None]), atol=1e-3
+    )
 
 
 def test_agents_of_many_scenes_share_a_forward(model: CoverNetForecaster) -> None:

@@ -45,7 +45,7 @@ def test_a_graph_forecasts_as_its_network(agents: int, context: Context) -> None
     features = some_features(agents)
     with torch.inference_mode():
         log_weights, positions = eager(features, context, 12)
-    native_weights, native = GraphForward(eager, EVERYTHING, context, 1)(features, context, 12)
+    native_weights, native = GraphForward(eager, context, 1)(features, context, 12)
     torch.testing.assert_close(native_weights.exp(), log_weights.exp(), atol=1e-4, rtol=0)
     torch.testing.assert_close(native.mean, positions.mean, atol=1e-3, rtol=0)
     sigma, native_sigma = (each.covariance.diagonal(dim1=-2, dim2=-1).sqrt() for each in (positions, native))
@@ -54,7 +54,7 @@ def test_a_graph_forecasts_as_its_network(agents: int, context: Context) -> None
 
 def test_fewer_steps_are_the_first_of_all() -> None:
     eager = network(HISTORY_ALONE)
-    graph = GraphForward(eager, HISTORY_ALONE, Context.FULL, 1)
+    graph = GraphForward(eager, Context.FULL, 1)
     features = some_features(3)
     short, whole = (graph(features, Context.FULL, steps)[1] for steps in (4, 12))
     torch.testing.assert_close(short.mean, whole.mean[:, :, :4], atol=0, rtol=0)
@@ -70,7 +70,7 @@ def test_fewer_steps_are_the_first_of_all() -> None:
 )
 def test_architectures_without_a_graph_are_told(config: NetworkConfig) -> None:
     with pytest.raises(LookupError, match="graph"):
-        GraphForward(CvaeNetworks(config).of(AgentType.VEHICLE), config, Context.FULL, 1)
+        GraphForward(CvaeNetworks(config).of(AgentType.VEHICLE), Context.FULL, 1)
 
 
 def test_a_model_of_another_history_stays_in_pytorch() -> None:

@@ -5,6 +5,9 @@ import math
 import pytest
 import torch
 
+from loadtest.forward import features_in_agent_frame
+from model.data.packing import pack_patches
+from model.features.spec import Frame
 from model.forecaster import Context
 from model.networks.config import NetworkConfig
 from model.networks.cvae import AgentNetwork
@@ -81,11 +84,63 @@ def test_the_generator_learns_to_fool_and_leaves_the_discriminator_alone(learner
 
 def test_the_map_encoder_has_a_rate_of_its_own(learner: HalentLearner) -> None:
     learner.step([batch(0), batch(16), batch(32)], WEIGHTS, 0.002)
-    encoder = learner.network.map_encoder
+    encoder = learner.networks.of(AgentType.VEHICLE).map_encoder
     assert encoder is not None
-    slow = next(group for group in learner.optimizer.param_groups if "rate_factor" in group)
+    slow = next(group for group in learner.optimizers["optimizer"].param_groups if "rate_factor" in group)
     assert slow["lr"] == pytest.approx(0.0008)
     assert {id(p) for p in slow["params"]} == {id(p) for p in encoder.parameters()}
+
+
+def in_the_agents_frame() -> tuple[HalentLearner, Batch]:
+    torch.manual_seed(0)
+    network = NetworkConfig(frame=Frame.AGENT, far_map=True, modes=5)
+    config = small_config(
+        Method.HALENTNET, network=network, rotate=False, precision="float32", adversarial_batch_size=4
+    )
+    features = features_in_agent_frame(4)
+    for name in ("map", "far_map"):
+        features[name] = torch.from_numpy(pack_patches(features[name].numpy()))
+    steps = torch.arange(1, STEPS + 1)
+    future = torch.stack([2.0 * steps, 0.1 * steps.square()], dim=-1).expand(4, STEPS, 2)
+    return HalentLearner(config, torch.device("cpu")), Batch(features, future)
+
+
+def test_in_the_agents_frame_one_step_teaches_both_networks() -> None:
+    learner, batch = in_the_agents_frame()
+    before = {name: parameters(module) for name, module in learner.modules().items()}
+    terms = learner.step([batch, batch, batch], WEIGHTS, 0.01)
+    assert {"discriminator", "fool", "creative", "nll", "loss"} <= set(terms)
+    assert all(torch.isfinite(term) for term in terms.values())
+    assert not any(same(module, before[name]) for name, module in learner.modules().items())
+
+
+def test_in_the_agents_frame_a_hallucination_drives_by_the_controls_of_two_modes() -> None:
+    learner, batch = in_the_agents_frame()
+    learner.networks.eval()
+    shown = learner.generator.show(batch)
+    with torch.no_grad():
+        modes = learner.generator.view(shown.features)
+        paths = torch.stack([modes.path.x, modes.path.y], dim=-1)
+        for z in range(5):
+            one = torch.full((4, STEPS), z)
+            drawn = learner.generator.sample(modes, shown.features, one)
+            torch.testing.assert_close(drawn, paths[:, z], atol=1e-4, rtol=1e-4)
+        switched = torch.where(torch.arange(STEPS) < 6, 0, 3).expand(4, STEPS)
+        path = learner.generator.sample(modes, shown.features, switched)
+    torch.testing.assert_close(path[:, :6], paths[:, 0, :6], atol=1e-4, rtol=1e-4)
+    assert (path[:, -1] - paths[:, 0, -1]).norm(dim=-1).min() > 1e-3
+
+
+def test_in_the_agents_frame_categories_are_drawn_from_the_posterior() -> None:
+    learner, batch = in_the_agents_frame()
+    learner.networks.eval()
+    shown = learner.generator.show(batch)
+    with torch.no_grad():
+        modes = learner.generator.view(shown.features)
+        there = torch.stack([modes.path.x[:, 2], modes.path.y[:, 2]], dim=-1)
+        narrow = modes._replace(sigma=torch.full_like(modes.sigma, 0.01))
+        drawn = learner.generator.latents(narrow, Batch(shown.features, there), WEIGHTS)
+    assert drawn.tolist() == [2] * 4
 
 
 def test_a_hallucination_changes_its_category_once_on_the_way(learner: HalentLearner) -> None:

@@ -350,28 +350,28 @@ def test_every_method_has_its_settings(method: Method) -> None:
 def test_every_method_is_trained_as_published_on_request(method: Method) -> None:
     ours, published = load_config(method), load_config(method, published=True)
     changed = {name for name, value in published.network if value != getattr(ours.network, name)}
-    if ours.in_agent_frame:
-        assert changed == {"frame"} | ({"far_map"} if ours.network.uses_map else set())
-    else:
-        assert changed == (set() if method is Method.COVERNET else {"max_control_sigma"})
+    assert ours.in_agent_frame
+    assert changed == {"frame"} | ({"far_map"} if ours.network.uses_map else set())
     assert not published.in_agent_frame
     assert getattr(published.network, "max_control_sigma", None) is None
     assert (published.kl_weight, published.blind_kl_weight, published.epochs) == (100, 5, 40)
     assert published.displacement_weight == 0
     assert ours.displacement_weight > 0 or ours.mixture.expected_ade > 0
-    assert published.rotate is (ours.in_agent_frame or ours.rotate)
+    assert published.rotate is (method is not Method.COVERNET)
+    assert not ours.rotate
     assert load_config(method, published=True, epochs=3).epochs == 3
     changes = {"epochs", "cooldown_epochs", "ema_decay"}
-    changes |= {"mixture", "variants"} if ours.in_agent_frame else {"displacement_weight"}
+    changes |= {"variants"} if method is Method.COVERNET else {"mixture", "variants"}
     assert {name for name, value in published if value != getattr(ours, name)} >= changes
 
 
 def test_a_short_run_has_short_phases() -> None:
-    whole, short = load_config(Method.RUBIZ), load_config(Method.RUBIZ, epochs=3)
+    late: dict[str, Any] = {"displacement_warmup_epochs": 12}
+    whole, short = load_config(Method.RUBIZ, **late), load_config(Method.RUBIZ, epochs=3, **late)
     assert whole.cooldown_epochs > 3
     assert whole.displacement_start > 1
     assert (short.cooldown_epochs, short.displacement_start) == (3, 1)
-    more = load_config(Method.RUBIZ, epochs=whole.epochs + 1)
+    more = load_config(Method.RUBIZ, epochs=whole.epochs + 1, **late)
     assert more == whole.model_copy(update={"epochs": whole.epochs + 1})
     assert load_config(Method.RUBIZ, epochs=3, cooldown_epochs=1).cooldown_epochs == 1
     with pytest.raises(TrainingError, match="cooldown_epochs 4 is more than epochs 3"):

@@ -13,7 +13,7 @@ from model.features.spec import Frame
 from model.forecaster import Context, Features
 from model.networks.agent_frame import STEPS, AgentFrameNetwork
 from model.networks.config import BlindContext, NetworkConfig
-from model.training.config import MixtureWeights
+from model.training.config import Method, MixtureWeights
 from model.training.mixture_objective import mixture_objective, step_log_density
 
 CONFIG = NetworkConfig(frame=Frame.AGENT, far_map=True, blind=BlindContext.NULL, modes=12)
@@ -45,7 +45,7 @@ def only(**weights: float) -> MixtureWeights:
 
 
 def value(network: AgentFrameNetwork, features: Features, future: Tensor, weights: MixtureWeights) -> Tensor:
-    return mixture_objective(network, features, future, weights, contrast=False).value
+    return mixture_objective(network, features, future, weights, Method.TRAJECTRON).value
 
 
 def reference(
@@ -130,13 +130,11 @@ def test_cab_adds_its_blind_forecast_and_presses_apart(
 ) -> None:
     plain = only(nll=1.0)
     full = value(network, features, future, plain).item()
-    loss = mixture_objective(
-        network, features, future, plain.model_copy(update={"blind": 0.5}), contrast=True
-    )
+    loss = mixture_objective(network, features, future, plain.model_copy(update={"blind": 0.5}), Method.CAB)
     blind = loss.terms["nll_blind"].item()
     assert loss.value.item() == pytest.approx(full + 0.5 * blind, rel=1e-5)
     apart = mixture_objective(
-        network, features, future, plain.model_copy(update={"blind": 0.0, "blind_kl": 2.0}), contrast=True
+        network, features, future, plain.model_copy(update={"blind": 0.0, "blind_kl": 2.0}), Method.CAB
     )
     assert apart.terms["kl_full_blind"].item() > 0
     assert apart.value.item() == pytest.approx(full - 2 * apart.terms["kl_full_blind"].item(), rel=1e-4)
@@ -147,9 +145,72 @@ def test_a_part_of_the_batch_may_be_forecast_blindly(
 ) -> None:
     weights = only(nll=1.0, blind=1.0, blind_share=0.4)
     some = {name: values[:2] for name, values in features.items()}
-    part = mixture_objective(network, features, future, weights, contrast=True).terms["nll_blind"]
-    whole = mixture_objective(network, some, future[:2], only(nll=1.0), contrast=True).terms["nll_blind"]
+    part = mixture_objective(network, features, future, weights, Method.CAB).terms["nll_blind"]
+    whole = mixture_objective(network, some, future[:2], only(nll=1.0), Method.CAB).terms["nll_blind"]
     assert part.item() == pytest.approx(whole.item(), rel=1e-5)
+
+
+@pytest.fixture
+def branched() -> AgentFrameNetwork:
+    torch.manual_seed(3)
+    return AgentFrameNetwork(CONFIG.model_copy(update={"blind": BlindContext.OWN})).eval()
+
+
+def blind_terms(network: AgentFrameNetwork, features: Features, future: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the blind branch's log-weights [N, K] and log-densities [N, K, T], from the forward itself."""
+    turned = features | {"heading": torch.zeros(len(future), dtype=torch.float64)}
+    log_weights, positions = network(turned, Context.BLIND, STEPS)
+    normal = MultivariateNormal(positions.mean.double(), positions.covariance.double())
+    return log_weights.double(), normal.log_prob(future[:, None].double())
+
+
+def test_reweight_counts_more_what_its_blind_branch_misses(
+    branched: AgentFrameNetwork, features: Features
+) -> None:
+    with torch.no_grad():
+        turned = features | {"heading": torch.zeros(5, dtype=torch.float64)}
+        near = branched(turned, Context.BLIND, STEPS)[1].mean[:, 0]
+        future = near + torch.linspace(0.0, 4.0, 5)[:, None, None]  # from well forecast to missed
+        log_weights, density = blind_terms(branched, features, future)
+        missed = torch.logsumexp(log_weights[..., None] + density, dim=1).mean(dim=-1)
+        weights, _, densities = reference(branched, features, future)
+        likelihood = torch.logsumexp(weights.double().log()[..., None] + densities, dim=1).mean(dim=-1)
+        loss = mixture_objective(branched, features, future, only(nll=1.0, blind=0.0), Method.REWEIGHT)
+    expected = -((1 + torch.sigmoid(-missed)) * likelihood).mean()
+    assert loss.value.item() == pytest.approx(expected.item(), rel=1e-3)
+    assert 0.3 < loss.terms["share"] < 0.99
+
+
+def test_reweights_share_has_no_gradient(
+    branched: AgentFrameNetwork, features: Features, future: Tensor
+) -> None:
+    mixture_objective(branched, features, future, only(nll=1.0, blind=0.0), Method.REWEIGHT).value.backward()
+    assert branched.blind_network is not None
+    assert all(p.grad is None or p.grad.abs().max() == 0 for p in branched.blind_network.parameters())
+
+
+def test_rubiz_fuses_the_latents_of_both_contexts(
+    branched: AgentFrameNetwork, features: Features, future: Tensor
+) -> None:
+    with torch.no_grad():
+        blind, _ = blind_terms(branched, features, future)
+        weights, _, densities = reference(branched, features, future)
+        full = weights.double().log()
+        fused = (full.sigmoid() * blind.sigmoid()).log_softmax(dim=-1)
+        by = [-torch.logsumexp(one[..., None] + densities, dim=1).mean().item() for one in (full, fused)]
+        loss = mixture_objective(branched, features, future, only(nll=1.0, blind=0.0), Method.RUBIZ)
+    assert loss.terms["nll_fused"].item() == pytest.approx(by[1], rel=1e-3)
+    assert loss.value.item() == pytest.approx(0.1 * by[0] + by[1], rel=1e-3)
+
+
+def test_the_fused_latent_teaches_both_branches(
+    branched: AgentFrameNetwork, features: Features, future: Tensor
+) -> None:
+    mixture_objective(branched, features, future, only(nll=1.0, blind=0.0), Method.RUBIZ).value.backward()
+    assert branched.blind_network is not None
+    for network in (branched, branched.blind_network):
+        assert network.mode_logits.weight.grad is not None
+        assert network.mode_logits.weight.grad.abs().max() > 0
 
 
 def with_one_neighbor(features: Features, x: float, y: float, vx: float) -> Features:

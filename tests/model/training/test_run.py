@@ -144,9 +144,16 @@ def test_a_log_replaces_the_rows_of_epochs_done_again(tmp_path: Path) -> None:
     assert [(row["epoch"], row["loss"]) for row in log.rows()] == [("1", "3.0"), ("2", "1.0")]
 
 
-@pytest.mark.parametrize("method", [Method.CAB, Method.TRAJECTRON])
-def test_a_run_in_the_agents_frame_on_several_sources(run: Run, method: Method) -> None:
-    blind = BlindContext.NULL if method is Method.CAB else BlindContext.NONE
+@pytest.mark.parametrize(
+    ("method", "blind"),
+    [
+        (Method.CAB, BlindContext.NULL),
+        (Method.TRAJECTRON, BlindContext.NONE),
+        (Method.RUBIZ, BlindContext.OWN),
+        (Method.HALENTNET, BlindContext.NONE),
+    ],
+)
+def test_a_run_in_the_agents_frame_on_several_sources(run: Run, method: Method, blind: BlindContext) -> None:
     network = NetworkConfig(frame=Frame.AGENT, far_map=True, blind=blind, modes=6)
     config = small_config(
         method,
@@ -189,3 +196,25 @@ def test_a_run_in_the_agents_frame_on_several_sources(run: Run, method: Method) 
     second, _ = go(replace(first, config=config))
     for name, tensor in load_checkpoint(second).tensors.items():
         torch.testing.assert_close(tensor, vehicles[name], atol=1e-6, rtol=1e-5, msg=name)
+
+
+def test_covernet_is_trained_in_the_agents_frame(run: Run) -> None:
+    network = CoverNetConfig(frame=Frame.AGENT, far_map=True, modes=6)
+    config = small_config(
+        Method.COVERNET,
+        network=network,
+        rotate=False,
+        variants=1,
+        context_dropout=True,
+        stopped_vehicles=True,
+        jitter=True,
+    )
+    folder, _ = go(replace(run, config=config))
+    checkpoint = load_checkpoint(folder)
+    assert isinstance(checkpoint.network, CoverNetConfig)
+    assert checkpoint.network.model_copy(update={"members": 0}) == network
+    assert {"vehicle.far_picture.convs.0.weight", "vehicle.cover"} <= checkpoint.tensors.keys()
+    card = (folder / "README.md").read_text()
+    settings = tomllib.loads(card.split("```toml\n")[1].split("```")[0])
+    assert "mixture" not in settings
+    assert settings["network"]["far_map"] is True
