@@ -72,7 +72,7 @@ def usable_cores(quota: Path = _CGROUP_QUOTA) -> float:
 
 def _models(settings: Settings) -> Iterator[Finding]:
     try:
-        models = load_models(settings)
+        models = load_models(settings.model_copy(update={"threads": 1}))  # the check itself needs no more
     except SettingsError as error:
         yield Finding("models", Level.FAIL, str(error))
         return

@@ -82,7 +82,7 @@ def test_surroundings_that_are_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
         port = taken.getsockname()[1]
         monkeypatch.setenv("FORECAST_HTTP", f"127.0.0.1:{port}")
         monkeypatch.setenv("FORECAST_GRPC", "0.0.0.0:0")
-        monkeypatch.setenv("FORECAST_THREADS", "10000")
+        monkeypatch.setenv("FORECAST_THREADS", "64")
         monkeypatch.setenv("FORECAST_MAX_CONCURRENT_CALLS", "100000000")
         with socket.socket() as closed:  # nobody listens there
             closed.bind(("127.0.0.1", 0))
