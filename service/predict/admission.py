@@ -32,6 +32,8 @@ _DEVIATIONS = 2.0
 """Mean deviations above the mean within which nearly all calls are finished."""
 _FIRST_DEVIATION = 0.1
 _MIN_FACTOR, _MAX_FACTOR = 0.5, 4.0
+_TRIAL_SECONDS = 1.0
+"""Seconds between calls that are accepted even if they are expected to be late."""
 _TRANSIT = 0.004
 """Seconds that are left for the response on its way to the client."""
 _BATCHES_AHEAD = 2
@@ -74,6 +76,8 @@ class Call:
         """Name of the caller's key; None: there is none."""
         self.when_sent: Callable[[], None] | None = None
         """Function to call once the response has been sent; None: there is none."""
+        self.is_trial = False
+        """True if it was accepted even if it is expected to be late."""
         self.share = 0
         """Number of its agents that count as planned ahead of the model."""
 
@@ -201,6 +205,7 @@ class Admission:
         self._planned = 0
         self._turns: list[_Turn] = []
         self._sizes: deque[int] = deque(maxlen=_SIZES)
+        self._tried = -math.inf
         self._top_priority = 0
         self._top_since = -math.inf
 
@@ -226,8 +231,10 @@ class Admission:
         self._require_room(1, priority, displace=False)
         order = (-priority, deadline)
         agents = min(self._sizes, default=1) if self._backlog.work_before(order) else 1
-        self._require_time(order, agents, now)
-        return Call(deadline)
+        call = Call(deadline)
+        call.is_trial = self._may_try(now)
+        self._require_time(order, agents, now, call.is_trial)
+        return call
 
     @contextmanager
     def in_progress(self, call: Call, agents: int, priority: int = 0) -> Iterator[None]:
@@ -247,7 +254,7 @@ class Admission:
         self._learn(call)
         self._require_room(call.agents, priority, displace=True)
         call.work = self.costs.work(call.agents)
-        call.expected = self._require_time(call.order, call.agents, call.sized)
+        call.expected = self._require_time(call.order, call.agents, call.sized, call.is_trial)
         self._backlog.begin(call, call.sized)
         call.places += call.agents
         self._count(call.agents)
@@ -316,8 +323,7 @@ class Admission:
             call = turn.call
             if turn.given.done():
                 continue
-            # With nothing ahead a call gets its turn even so: expectations may be wrong
-            if call.deadline < now + (self.costs.work(call.agents) if self._planned else 0.0):
+            if call.deadline < now + (0.0 if call.is_trial else self.costs.work(call.agents)):
                 self._metrics.refused.labels("dropped").inc()
                 turn.given.set_exception(DeadlineExceeded("the deadline passed while the call was queued"))
                 continue
@@ -359,26 +365,36 @@ class Admission:
                 Overloaded("calls of a higher priority have filled the queue", self._retry_after())
             )
 
-    def _require_time(self, order: Order, agents: int, now: float) -> float:
-        """Refuse a call that would be late.
+    def _may_try(self, now: float) -> bool:
+        """Return whether a call is accepted even if it is expected to be late.
 
-        A call is never refused while the model is free and nothing waits: expectations may be wrong.
+        That is so once a second while the model is free and nothing waits: otherwise a wrong expectation
+        could never be corrected.
+        """
+        if self._backlog or self.busy_until is not None or now < self._tried + _TRIAL_SECONDS:
+            return False
+        self._tried = now
+        return True
+
+    def _require_time(self, order: Order, agents: int, now: float, is_trial: bool) -> float:
+        """Refuse a call that would be late.
 
         Args:
             order: its order.
             agents: number of agents to forecast.
             now: the time.
+            is_trial: whether it is accepted as long as its deadline has not passed.
 
         Returns:
-            The expected seconds until it is answered, without the margin; 0 if nothing is in its way.
+            The expected seconds until it is answered, without the margin.
 
         Raises:
-            Overloaded: work that goes first leaves too little time.
+            Overloaded: too little time is left.
         """
         expected = self._expected(order, agents, now)
-        needed = expected * self._margin.factor + _TRANSIT
+        needed = (0.0 if is_trial else expected * self._margin.factor) + _TRANSIT
         remaining = order[1] - now
-        if expected and needed > remaining:
+        if needed > remaining:
             self._metrics.refused.labels("late").inc()
             raise Overloaded(
                 f"the forecast would take {needed:.2f} s, and the deadline is in {max(remaining, 0):.2f} s",
@@ -387,9 +403,7 @@ class Admission:
         return expected
 
     def _expected(self, order: Order, agents: int, now: float) -> float:
-        """Return the expected seconds until a new call is answered; 0 if nothing is in its way."""
-        if not self._backlog and self.busy_until is None:
-            return 0.0
+        """Return the expected seconds until a new call is answered."""
         work = self.costs.work(agents)
         in_model = 0.0 if self.busy_until is None else max(self.busy_until - now, 0.0)
         return max(work + in_model, self._backlog.seconds(self._backlog.work_before(order) + work))

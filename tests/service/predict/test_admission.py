@@ -82,11 +82,20 @@ async def test_a_call_that_would_be_late_is_refused() -> None:
     assert admission.waiting == 0
 
 
-async def test_nothing_is_refused_while_the_model_is_free_and_nothing_waits() -> None:
+async def test_a_free_model_tries_a_call_a_second_that_is_expected_to_be_late(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     admission = make()
     admission.busy_until = None
+    with pytest.raises(Overloaded):
+        admission.admit(now())  # its deadline has passed: nothing can be learned from it
+    monkeypatch.setattr("service.predict.admission._TRIAL_SECONDS", 0.0)
     with Calls(admission) as calls:
-        calls.begin(500, seconds=0.01)
+        tried = calls.begin(500, seconds=0.1)
+        await admission.turn(tried)
+    monkeypatch.setattr("service.predict.admission._TRIAL_SECONDS", 1000.0)
+    with Calls(admission) as calls, pytest.raises(Overloaded):
+        calls.begin(500, seconds=0.1)
 
 
 async def test_work_that_goes_later_is_no_wait() -> None:
