@@ -13,11 +13,14 @@ from typing import Any
 import typer
 
 from cli.main import app
+from loadtest.peers.report import Comparisons
 from service.settings_reference import settings_reference
 
 DOCS = Path(__file__).resolve().parent
 BENCHMARK = DOCS / "data/benchmark_train_val.json"
 """Benchmark figures of the bundled checkpoints on nuScenes train_val."""
+PEERS = DOCS / "data/peers.json"
+"""Comparison with other servers, as ``make peers`` writes it."""
 
 Row = dict[str, Any]
 
@@ -167,6 +170,7 @@ def benchmark(key: str) -> list[Row]:
 
 
 PAGES: dict[str, dict[str, Callable[[], str]]] = {
+    "performance.md": {"peers": lambda: Comparisons.read(PEERS).markdown()},
     "settings.md": {"settings": settings_table},
     "models.md": {
         "displacement_causal": lambda: displacement_table("displacement_causal"),

@@ -111,6 +111,7 @@ async def compare(name: str, options: Options) -> Take:
         {} if options.threads is None else {"threads": options.threads}
     )
     measurements: list[Measurement] = []
+    load_before = os.getloadavg()[0]
     async with AsyncExitStack() as stack:
         server = await asyncio.to_thread(stack.enter_context, serving(options.models, **settings))
         wire = GrpcWire(server.grpc)
@@ -129,6 +130,7 @@ async def compare(name: str, options: Options) -> Take:
         batches=peer.batches,
         date=datetime.now(UTC).isoformat(timespec="seconds"),
         conditions=_conditions(options),
+        load_before=load_before,
         raw_agents_per_second=raw,
         measurements=measurements,
     )

@@ -40,6 +40,8 @@ class Take(BaseModel):
     """Explanation of how it joins calls."""
     date: str
     conditions: str
+    load_before: float
+    """Number of threads that wanted to run on the machine in the minute before, on average."""
     raw_agents_per_second: float
     """The raw forward's best batch rate in the process of the clients, in the same run; 0: not measured."""
     measurements: list[Measurement]
@@ -67,6 +69,8 @@ class Comparisons(BaseModel):
 
     def markdown(self) -> str:
         """Return a table for each number of agents, and how they were measured."""
+        if not self.takes:
+            return "Nothing has been measured yet."
         sizes = sorted({one.agents for take in self.takes for one in take.measurements})
         notes = "\n".join(f"- {line}" for line in self._notes())
         return "\n\n".join([*(self._table(agents) for agents in sizes), notes])
@@ -77,7 +81,12 @@ class Comparisons(BaseModel):
         raw = [take.raw_agents_per_second for take in self.takes]
         yield (
             f"Measured on {' to '.join(dict.fromkeys((days[0], days[-1])))}. The raw forward's best batch "
-            f"rate in the same runs: {min(raw):.0f} to {max(raw):.0f} agents/s."
+            f"rate in the same runs: {_range(raw)} agents/s."
+        )
+        load = _range([take.load_before for take in self.takes])
+        yield (
+            f"Load average of the machine before the runs: {load}. Above 1, other work took part of the "
+            "machine, and only the ratios hold."
         )
         sides = [side for take in self.takes for one in take.measurements for side in (one.peer, one.ours)]
         yield (
@@ -103,6 +112,10 @@ class Comparisons(BaseModel):
         for take, own in takes:
             rows.append([take.title, *_figures(own, clients, lambda one: one.peer)])
         return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+
+
+def _range(values: Sequence[float]) -> str:
+    return " to ".join(dict.fromkeys(f"{value:.0f}" for value in (min(values), max(values))))
 
 
 def _figures(
