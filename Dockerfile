@@ -20,10 +20,12 @@ ENV PATH=/opt/cab-forecast/bin:$PATH \
     PYTHONUNBUFFERED=1 \
     FORECAST_HTTP=0.0.0.0:8080 \
     FORECAST_GRPC=0.0.0.0:50051 \
+    FORECAST_PROBES=127.0.0.1:8081 \
     FORECAST_LOG_JSON=true
+# It listens on all addresses, so it starts only with keys, or if it is told to allow anyone: see docs/security.md
 USER 10001
 EXPOSE 8080 50051
 HEALTHCHECK --interval=10s --timeout=3s --start-period=30s \
-  CMD ["python", "-c", "import urllib.request; urllib.request.urlopen('http://127.0.0.1:8080/readyz', timeout=2)"]
+  CMD ["python", "-c", "import urllib.request; urllib.request.urlopen('http://127.0.0.1:8081/readyz', timeout=2)"]
 # On SIGTERM the server drains and stops
 CMD ["cab-forecast", "serve"]

@@ -3,16 +3,19 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 NUSCENES := .venv-nuscenes
+AUDIT := .venv-audit
 PEERS := $(patsubst loadtest/peers/requirements-%.txt,%,$(wildcard loadtest/peers/requirements-*.txt))
 # Triton's Python backend needs libpython as a shared library, as Debian's Python has it.
 PEERS_PYTHON ?= /usr/bin/python3
 BUF := npm exec --yes --package=@bufbuild/buf@1.75.0 -- buf
 # For example PIP_FLAGS="--extra-index-url https://download.pytorch.org/whl/cpu" for the CPU build of torch.
 PIP_FLAGS ?=
+# For example AUDIT_FLAGS="--ignore-vuln ID" for a finding that docs/security.md lists.
+AUDIT_FLAGS ?=
 PROTOC := PATH="$(CURDIR)/$(BIN):$$PATH" python -m grpc_tools.protoc
 PROTOS := $(wildcard proto/cab/forecast/v1/*.proto)
 
-.PHONY: install run test test-nuscenes bench loadtest peers peers-install faults lint format docs proto proto-check proto-lint lock clean
+.PHONY: install run test test-nuscenes bench loadtest peers peers-install faults lint format docs proto proto-check proto-lint audit lock clean
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -86,8 +89,23 @@ proto-check: install  ## fail if the generated code differs from proto/
 proto-lint:  ## run buf lint; needs node
 	$(BUF) lint
 
+# The tools have an environment of their own, and so have the dependencies of the image that the bill of materials lists.
+$(AUDIT)/.installed: pyproject.toml constraints.txt
+	test -x $(AUDIT)/bin/python || $(PYTHON) -m venv $(AUDIT)
+	test -x $(AUDIT)/image/bin/python || $(PYTHON) -m venv --without-pip $(AUDIT)/image
+	$(AUDIT)/bin/python -m pip install --quiet --disable-pip-version-check pip-audit==2.10.1 cyclonedx-bom==7.5.0
+	$(AUDIT)/bin/python -m pip --python $(AUDIT)/image/bin/python install --quiet --disable-pip-version-check \
+	  $(PIP_FLAGS) -c constraints.txt .
+	touch $@
+
+audit: $(AUDIT)/.installed  ## list the image's packages (CycloneDX, build/sbom.json); check all pins for known vulnerabilities
+	mkdir -p build
+	$(AUDIT)/bin/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible --of JSON \
+	  -o build/sbom.json $(AUDIT)/image/bin/python
+	$(AUDIT)/bin/pip-audit --strict --disable-pip --no-deps --progress-spinner off $(AUDIT_FLAGS) -r constraints.txt
+
 lock: install  ## write the installed versions to constraints.txt
 	$(BIN)/python -m pip freeze --exclude-editable | sed 's/+cpu$$//' > constraints.txt
 
 clean:  ## remove the environments and caches
-	rm -rf $(VENV) $(NUSCENES) .venv-peers .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) $(NUSCENES) $(AUDIT) .venv-peers .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

@@ -47,6 +47,10 @@ class Endpoint:
     """Maximum number of concurrent calls."""
     timeout: float = 60.0
     """Seconds for a call with its retries; also the time that a lost server is waited for."""
+    ca_file: Path | None = None
+    """See ``cab_forecast.Client``, as for the two below."""
+    certificate_file: Path | None = None
+    key_file: Path | None = None
 
 
 class Progress:
@@ -332,7 +336,15 @@ async def listed_models(client: AsyncClient) -> list[Model]:
 async def _replay(
     benchmark: Benchmark, endpoint: Endpoint, names: Sequence[str], progress: Progress
 ) -> dict[str, Model]:
-    async with AsyncClient(endpoint.address, endpoint.token, endpoint.timeout, RETRIES) as client:
+    async with AsyncClient(
+        endpoint.address,
+        endpoint.token,
+        endpoint.timeout,
+        RETRIES,
+        ca_file=endpoint.ca_file,
+        certificate_file=endpoint.certificate_file,
+        key_file=endpoint.key_file,
+    ) as client:
         models = _selected(await listed_models(client), benchmark.protocol, names, progress, "the endpoint")
         total = benchmark.forecasts * len(models)
         with progress.task(f"requesting {len(models)} models", total, "forecasts") as tick:

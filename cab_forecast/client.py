@@ -2,7 +2,7 @@
 
 from os import PathLike
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import tenacity
 
@@ -42,6 +42,7 @@ from cab_forecast.connection import (
     Connection,
     Encoding,
     Transport,
+    from_variables,
 )
 from cab_forecast.endpoints import DEFAULT_ENDPOINT
 from cab_forecast.streams import AsyncStream, OpenStream, Stream
@@ -64,24 +65,53 @@ class Client:
         *,
         encoding: Encoding = "protobuf",
         ca_file: str | PathLike[str] | None = None,
+        certificate_file: str | PathLike[str] | None = None,
+        key_file: str | PathLike[str] | None = None,
     ) -> None:
         """Create a client; it connects at the first call.
 
         Args:
             endpoint: ``grpc://host:port``, ``grpcs://``, ``http://`` or ``https://``; bare ``host:port``
                 is gRPC.
-            token: bearer token; over ``grpc://`` and ``http://`` it is sent unencrypted.
+            token: API key or bearer token; over ``grpc://`` and ``http://`` it is sent unencrypted.
             timeout: seconds for a call, retries included; the server is told the remaining time.
             retries: max number of retries of a call.
             encoding: ``protobuf`` or ``json`` for REST bodies.
             ca_file: PEM certificates to trust instead of the system's.
+            certificate_file: PEM certificate of this client, for servers that require one.
+            key_file: PEM private key of that certificate.
 
         Raises:
             ValueError: an argument is out of range.
             OSError: the certificates cannot be read.
         """
-        self._settings = ClientSettings(endpoint, token, timeout, retries, encoding=encoding, ca_file=ca_file)
+        self._settings = ClientSettings(
+            endpoint,
+            token,
+            timeout,
+            retries,
+            encoding=encoding,
+            ca_file=ca_file,
+            certificate_file=certificate_file,
+            key_file=key_file,
+        )
         self._transport = _connect(self._settings.connection)
+
+    @classmethod
+    def from_environment(cls, **arguments: Any) -> Self:
+        """Create a client whose endpoint, key and certificates environment variables set.
+
+        The variables are CAB_FORECAST_ENDPOINT, CAB_FORECAST_TOKEN, CAB_FORECAST_CA_FILE,
+        CAB_FORECAST_CERTIFICATE_FILE and CAB_FORECAST_KEY_FILE.
+
+        Args:
+            arguments: arguments of the client, which go before the variables.
+
+        Raises:
+            ValueError: an argument is out of range.
+            OSError: the certificates cannot be read.
+        """
+        return cls(**(from_variables() | arguments))
 
     def predict(self, request: PredictRequest, timeout: float | None = None) -> PredictResponse:
         """Forecast the agents of a scene.
@@ -237,11 +267,27 @@ class AsyncClient:
         *,
         encoding: Encoding = "protobuf",
         ca_file: str | PathLike[str] | None = None,
+        certificate_file: str | PathLike[str] | None = None,
+        key_file: str | PathLike[str] | None = None,
     ) -> None:
         """See ``Client``."""
-        self._settings = ClientSettings(endpoint, token, timeout, retries, encoding=encoding, ca_file=ca_file)
+        self._settings = ClientSettings(
+            endpoint,
+            token,
+            timeout,
+            retries,
+            encoding=encoding,
+            ca_file=ca_file,
+            certificate_file=certificate_file,
+            key_file=key_file,
+        )
         # Opened at the first call, because a channel belongs to the event loop that it is created in.
         self._transport: AsyncTransport | None = None
+
+    @classmethod
+    def from_environment(cls, **arguments: Any) -> Self:
+        """See ``Client.from_environment``."""
+        return cls(**(from_variables() | arguments))
 
     async def predict(self, request: PredictRequest, timeout: float | None = None) -> PredictResponse:  # noqa: ASYNC109 - it goes to the server, too
         """See ``Client.predict``."""

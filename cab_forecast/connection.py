@@ -1,5 +1,6 @@
 """Connection to a server: the client's settings, and the interface of the transports."""
 
+import os
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -13,6 +14,14 @@ from cab_forecast.timing import Budget
 DEFAULT_TIMEOUT = 5.0
 """Seconds for a call, retries included."""
 DEFAULT_RETRIES = 2
+_VARIABLES = {
+    "endpoint": "CAB_FORECAST_ENDPOINT",
+    "token": "CAB_FORECAST_TOKEN",
+    "ca_file": "CAB_FORECAST_CA_FILE",
+    "certificate_file": "CAB_FORECAST_CERTIFICATE_FILE",
+    "key_file": "CAB_FORECAST_KEY_FILE",
+}
+"""Environment variable of each argument of a client that can be set by one."""
 
 Encoding = Literal["protobuf", "json"]
 
@@ -27,6 +36,18 @@ class Connection:
     """Encoding of REST bodies; gRPC always uses protobuf."""
     ca_file: Path | None
     """PEM certificates to trust instead of the system's; None: the system's."""
+    certificate: tuple[Path, Path] | None = None
+    """PEM certificate of the client and its private key; None: the client presents none."""
+
+    @property
+    def may_need_certificate(self) -> bool:
+        """True if the connection uses TLS without a certificate of the client."""
+        return self.endpoint.secure and self.certificate is None
+
+
+def from_variables() -> dict[str, str]:
+    """Return the arguments of a client that environment variables set."""
+    return {argument: os.environ[name] for argument, name in _VARIABLES.items() if name in os.environ}
 
 
 class Transport(Protocol):
@@ -83,6 +104,8 @@ class ClientSettings:
         *,
         encoding: Encoding,
         ca_file: str | PathLike[str] | None,
+        certificate_file: str | PathLike[str] | None,
+        key_file: str | PathLike[str] | None,
     ) -> None:
         """See ``Client``.
 
@@ -94,8 +117,17 @@ class ClientSettings:
         if encoding not in ("protobuf", "json"):
             raise ValueError(f"encoding must be 'protobuf' or 'json', not {encoding!r}")
         Budget(timeout)  # refuse an invalid timeout here, not at the first call
+        if (certificate_file is None) != (key_file is None):
+            raise ValueError("certificate_file and key_file go together")
+        certificate = None
+        if certificate_file is not None and key_file is not None:
+            certificate = Path(certificate_file), Path(key_file)
         self.connection = Connection(
-            parse_endpoint(endpoint), token, encoding, Path(ca_file) if ca_file is not None else None
+            parse_endpoint(endpoint),
+            token,
+            encoding,
+            None if ca_file is None else Path(ca_file),
+            certificate,
         )
         if encoding == "json" and self.connection.endpoint.transport == "grpc":
             raise ValueError("encoding='json' is for http:// and https:// endpoints; gRPC uses protobuf")

@@ -8,6 +8,10 @@ TOO_LARGE = "TOO_LARGE"
 """Reason of a RESOURCE_EXHAUSTED that a retry cannot fix."""
 UNREACHABLE = "UNREACHABLE"
 """Reason of an UNAVAILABLE that the client raises itself, without a connection to the server."""
+UNTRUSTED = "UNTRUSTED"
+"""Reason of an UNAVAILABLE that the client raises itself: it does not trust the server's certificate."""
+_UNTRUSTED_TEXT = "CERTIFICATE_VERIFY_FAILED"
+"""Part of OpenSSL's and BoringSSL's message about such a certificate."""
 
 
 @dataclass(frozen=True)
@@ -66,9 +70,15 @@ class BadRequest(ForecastError):  # noqa: N818 - named like the status codes
 
 
 class Unauthenticated(ForecastError):  # noqa: N818
-    """The token is missing or not valid."""
+    """The key is missing or not valid."""
 
     default_code = "UNAUTHENTICATED"
+
+
+class PermissionDenied(ForecastError):  # noqa: N818
+    """The key does not permit the call: it lacks the scope."""
+
+    default_code = "PERMISSION_DENIED"
 
 
 class NotFound(ForecastError):  # noqa: N818
@@ -94,6 +104,10 @@ class Overloaded(ForecastError):  # noqa: N818
     retryable = True
 
 
+class LimitExceeded(Overloaded):
+    """The key has reached its rate, or its number of agents in progress."""
+
+
 class DeadlineExceeded(ForecastError):  # noqa: N818
     """The call's timeout passed before a response arrived."""
 
@@ -107,6 +121,12 @@ class Unavailable(ForecastError):  # noqa: N818
     retryable = True
 
 
+class Untrusted(Unavailable):
+    """The server's certificate is not trusted: it is expired, of another host or of an unknown authority."""
+
+    retryable = False
+
+
 class TrackingUnavailable(Unavailable):
     """The server's track memory does not respond; forecasts go on without it."""
 
@@ -117,10 +137,24 @@ class InternalError(ForecastError):
     default_code = "INTERNAL"
 
 
+def connection_failed(url: str, cause: str, *, may_need_certificate: bool) -> Unavailable:
+    """Return the exception for a call that got no connection.
+
+    Args:
+        url: URL of the endpoint.
+        cause: message of the transport.
+        may_need_certificate: True if the server may have missed a certificate of the client.
+    """
+    if _UNTRUSTED_TEXT in cause:
+        return Untrusted(f"the certificate of {url} is not trusted: {cause}", reason=UNTRUSTED)
+    hint = " (it may require a certificate of the client)" if may_need_certificate else ""
+    return Unavailable(f"no connection to {url}: {cause}{hint}", reason=UNREACHABLE)
+
+
 _BY_CODE: dict[str, type[ForecastError]] = {
     "INVALID_ARGUMENT": BadRequest,
     "UNAUTHENTICATED": Unauthenticated,
-    "PERMISSION_DENIED": Unauthenticated,
+    "PERMISSION_DENIED": PermissionDenied,
     "NOT_FOUND": NotFound,
     "RESOURCE_EXHAUSTED": Overloaded,
     "DEADLINE_EXCEEDED": DeadlineExceeded,
@@ -132,6 +166,7 @@ _BY_CODE: dict[str, type[ForecastError]] = {
 }
 _BY_REASON: dict[tuple[str, str], type[ForecastError]] = {
     ("RESOURCE_EXHAUSTED", TOO_LARGE): TooLarge,
+    ("RESOURCE_EXHAUSTED", "LIMIT_EXCEEDED"): LimitExceeded,
     ("NOT_FOUND", "UNKNOWN_TRACK"): UnknownTrack,
     ("UNAVAILABLE", "TRACKING_UNAVAILABLE"): TrackingUnavailable,
 }

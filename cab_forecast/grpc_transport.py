@@ -15,8 +15,7 @@ from grpc_status import rpc_status
 
 from cab.forecast.v1.routes import Request, Response, Route
 from cab_forecast.connection import Connection
-from cab_forecast.endpoints import Endpoint
-from cab_forecast.errors import TOO_LARGE, UNREACHABLE, FieldViolation, ForecastError, error_for
+from cab_forecast.errors import TOO_LARGE, FieldViolation, ForecastError, connection_failed, error_for
 from cab_forecast.streams import OpenStream, Stream
 from cab_forecast.timing import Budget
 
@@ -35,13 +34,16 @@ _OPTIONS: Sequence[tuple[str, int]] = (
     ("grpc.http2.max_pings_without_data", 0),
 )
 
+_BROKEN_OFF = "Socket closed"
+"""Part of gRPC's message about a server that ended the connection, as one that misses a certificate does."""
+
 
 class GrpcTransport:
     """Blocking transport over one channel; usable from several threads."""
 
     def __init__(self, connection: Connection) -> None:
         endpoint = connection.endpoint
-        self._endpoint = endpoint
+        self._connection = connection
         self._metadata = _metadata(connection)
         self._channel = (
             grpc.secure_channel(endpoint.target, _credentials(connection), _OPTIONS)
@@ -55,7 +57,7 @@ class GrpcTransport:
         try:
             response: Response = invoke(request, timeout=budget.remaining(), metadata=self._metadata)
         except grpc.RpcError as error:
-            raise error_from_call(error, self._endpoint) from error
+            raise error_from_call(error, self._connection) from error
         return response
 
     def open(self, route: Route[Request, Response], request: Request, budget: Budget) -> Stream[Response]:
@@ -75,13 +77,15 @@ class GrpcTransport:
         try:
             first = next(call, None)
         except grpc.RpcError as error:
-            raise (budget.exceeded() if late.is_set() else error_from_call(error, self._endpoint)) from error
+            if late.is_set():
+                raise budget.exceeded() from error
+            raise error_from_call(error, self._connection) from error
         except BaseException:
             call.cancel()
             raise
         finally:
             timer.cancel()
-        return Stream(_messages(call, first, self._endpoint), call.cancel)
+        return Stream(_messages(call, first, self._connection), call.cancel)
 
     def close(self) -> None:
         """See ``Transport.close``."""
@@ -93,7 +97,7 @@ class AsyncGrpcTransport:
 
     def __init__(self, connection: Connection) -> None:
         endpoint = connection.endpoint
-        self._endpoint = endpoint
+        self._connection = connection
         self._metadata = _metadata(connection)
         self._channel = (
             aio.secure_channel(endpoint.target, _credentials(connection), _OPTIONS)
@@ -107,7 +111,7 @@ class AsyncGrpcTransport:
         try:
             response: Response = await invoke(request, timeout=budget.remaining(), metadata=self._metadata)
         except aio.AioRpcError as error:
-            raise error_from_call(error, self._endpoint) from error
+            raise error_from_call(error, self._connection) from error
         return response
 
     async def open(
@@ -121,7 +125,7 @@ class AsyncGrpcTransport:
             async with asyncio.timeout(left):
                 first = await call.read()
         except aio.AioRpcError as error:
-            raise error_from_call(error, self._endpoint) from error
+            raise error_from_call(error, self._connection) from error
         except TimeoutError as error:
             call.cancel()
             raise budget.exceeded() from error
@@ -132,14 +136,14 @@ class AsyncGrpcTransport:
         async def cancel() -> None:
             call.cancel()
 
-        return OpenStream(_async_messages(call, first, self._endpoint), cancel)
+        return OpenStream(_async_messages(call, first, self._connection), cancel)
 
     async def close(self) -> None:
         """See ``AsyncTransport.close``."""
         await self._channel.close(None)
 
 
-def _messages(call: Iterator[Response], first: Response | None, endpoint: Endpoint) -> Iterator[Response]:
+def _messages(call: Iterator[Response], first: Response | None, connection: Connection) -> Iterator[Response]:
     """Yield all messages except empty ones, which only say that the call has started."""
     message = first
     try:
@@ -148,11 +152,11 @@ def _messages(call: Iterator[Response], first: Response | None, endpoint: Endpoi
                 yield message
             message = next(call, None)
     except grpc.RpcError as error:
-        raise error_from_call(error, endpoint) from error
+        raise error_from_call(error, connection) from error
 
 
 async def _async_messages(
-    call: "aio.UnaryStreamCall[Request, Response]", first: Any, endpoint: Endpoint
+    call: "aio.UnaryStreamCall[Request, Response]", first: Any, connection: Connection
 ) -> AsyncGenerator[Response]:
     """See ``_messages``."""
     message = first
@@ -162,15 +166,15 @@ async def _async_messages(
                 yield message
             message = await call.read()
     except aio.AioRpcError as error:
-        raise error_from_call(error, endpoint) from error
+        raise error_from_call(error, connection) from error
 
 
-def error_from_call(call: grpc.RpcError, endpoint: Endpoint) -> ForecastError:
+def error_from_call(call: grpc.RpcError, connection: Connection) -> ForecastError:
     """Return the exception for a failed call, from its status and the google.rpc details in its trailers.
 
     Args:
         call: the error that gRPC raised, which is the ended call as well.
-        endpoint: the endpoint, for the message if the server could not be reached.
+        connection: the connection, for the message if the server could not be reached.
     """
     code, message = call.code().name, call.details() or ""
     reason, retry_after = "", None
@@ -186,8 +190,13 @@ def error_from_call(call: grpc.RpcError, endpoint: Endpoint) -> ForecastError:
             retry_after = retry.retry_delay.ToNanoseconds() / 1e9
     if not details and code == "UNAVAILABLE":
         # The server's own UNAVAILABLE has details; this one comes from the channel.
-        message, reason = f"no connection to {endpoint.url}: {message}", UNREACHABLE
-    elif not details and code == "RESOURCE_EXHAUSTED" and "larger than max" in message:
+        broken_off = _BROKEN_OFF in message
+        return connection_failed(
+            connection.endpoint.url,
+            message,
+            may_need_certificate=broken_off and connection.may_need_certificate,
+        )
+    if not details and code == "RESOURCE_EXHAUSTED" and "larger than max" in message:
         # gRPC's own size limit refused the message before the server's code could.
         reason = TOO_LARGE
     return error_for(
@@ -208,7 +217,11 @@ def _metadata(connection: Connection) -> tuple[tuple[str, str], ...]:
 
 
 def _credentials(connection: Connection) -> grpc.ChannelCredentials:
-    return grpc.ssl_channel_credentials(connection.ca_file.read_bytes() if connection.ca_file else None)
+    authorities = None if connection.ca_file is None else connection.ca_file.read_bytes()
+    if connection.certificate is None:
+        return grpc.ssl_channel_credentials(authorities)
+    chain, key = (path.read_bytes() for path in connection.certificate)
+    return grpc.ssl_channel_credentials(authorities, key, chain)
 
 
 def _serialize(message: Message) -> bytes:

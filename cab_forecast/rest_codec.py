@@ -22,6 +22,7 @@ from cab_forecast.errors import (
     ForecastError,
     InternalError,
     Unavailable,
+    connection_failed,
     error_for,
 )
 from cab_forecast.timing import Budget, StreamTimeouts
@@ -59,6 +60,7 @@ class Codec:
 
     def __init__(self, connection: Connection) -> None:
         self._endpoint: Endpoint = connection.endpoint
+        self._may_need_certificate = connection.may_need_certificate
         self._media_type = _MEDIA_TYPES[connection.encoding]
         self._headers = {"Authorization": f"Bearer {connection.token}"} if connection.token else {}
 
@@ -119,7 +121,11 @@ class Codec:
         if isinstance(error, (httpx.TimeoutException, TimeoutError)):
             return DeadlineExceeded(f"no response from {self._endpoint.url} within {budget.timeout:g} s")
         cause = str(error) or type(error).__name__
-        return Unavailable(f"no connection to {self._endpoint.url}: {cause}", reason=UNREACHABLE)
+        # A server that misses a certificate ends the connection instead of a handshake or a response
+        broken_off = isinstance(error, (httpx.ReadError, httpx.RemoteProtocolError))
+        return connection_failed(
+            self._endpoint.url, cause, may_need_certificate=broken_off and self._may_need_certificate
+        )
 
     def stream_error(self, error: httpx.TransportError, idle_timeout: float) -> ForecastError:
         """Return the exception for a stream that was interrupted.

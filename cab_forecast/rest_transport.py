@@ -154,4 +154,13 @@ def _shut_down(response: httpx.Response) -> None:
 
 
 def _verify(connection: Connection) -> ssl.SSLContext | bool:
-    return ssl.create_default_context(cafile=connection.ca_file) if connection.ca_file else True
+    if connection.ca_file is None and connection.certificate is None:
+        return True
+    context = (
+        httpx.create_ssl_context()
+        if connection.ca_file is None
+        else ssl.create_default_context(cafile=connection.ca_file)
+    )
+    if connection.certificate is not None:
+        context.load_cert_chain(*connection.certificate)
+    return context

@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cab_forecast.endpoints import DEFAULT_ENDPOINT
-from cli.connection import Endpoint, Token
+from cli.connection import Connection, with_connection
 from cli.failures import fail
 
 if TYPE_CHECKING:
-    from benchmark import BenchmarkRun, Progress
+    from benchmark import BenchmarkRun, Endpoint, Progress
 
 _SAMPLES = 2000
 _REFUSALS_SHOWN = 5
@@ -24,7 +23,7 @@ _REFUSALS_SHOWN = 5
 def register(app: typer.Typer) -> None:
     """Add the commands."""
     group = typer.Typer(help=benchmark.__doc__, invoke_without_command=True)
-    group.callback()(benchmark)
+    group.callback()(with_connection(benchmark))
     group.command("compare")(compare)
     app.add_typer(group, name="benchmark")
 
@@ -37,8 +36,7 @@ def benchmark(
         typer.Option(file_okay=False, help="Folder for responses and report; an interrupted run resumes."),
     ] = None,
     *,
-    endpoint: Endpoint = DEFAULT_ENDPOINT,
-    token: Token = None,
+    connection: Connection,
     split: Annotated[str, typer.Option(help="Split to evaluate on.")] = "train_val",
     protocol: Annotated[
         str, typer.Option(help="Protocol of the inputs: causal, or paper to compare with published tables.")
@@ -82,7 +80,6 @@ def benchmark(
     if data is None or folder is None:
         fail("--data and --out are needed (--data and --from, to evaluate saved responses)")
     from benchmark import Benchmark, BenchmarkError, run_benchmark
-    from benchmark import Endpoint as EndpointUnderTest
     from model.data.scenes import DataError
     from model.data.sources import READERS, parse_data, parse_protocol
     from model.metrics.density import DRAWS
@@ -104,7 +101,7 @@ def benchmark(
                 consistency,
                 limit,
             ),
-            None if saved else EndpointUnderTest(endpoint, token, concurrency, timeout),
+            None if saved else _endpoint(connection, concurrency, timeout),
             folder,
             names=names,
             processes=processes or len(os.sched_getaffinity(0)),
@@ -115,6 +112,20 @@ def benchmark(
     _show(run, folder)
     if missing := run.results.missing:
         fail(f"{missing} forecasts are missing: the metrics leave them out")
+
+
+def _endpoint(connection: Connection, concurrency: int, timeout: float) -> "Endpoint":
+    from benchmark import Endpoint
+
+    return Endpoint(
+        connection.endpoint,
+        connection.token,
+        concurrency,
+        timeout,
+        connection.ca_file,
+        connection.certificate_file,
+        connection.key_file,
+    )
 
 
 def compare(

@@ -6,8 +6,7 @@ from typing import Annotated
 
 import typer
 
-from cab_forecast.endpoints import DEFAULT_ENDPOINT
-from cli.connection import DEFAULT_TIMEOUT, AsJson, Connection, Endpoint, Timeout, Token, connect
+from cli.connection import DEFAULT_TIMEOUT, AsJson, Connection, Timeout, connect, with_connection
 
 Scene = Annotated[str, typer.Argument(metavar="SCENE", help="The scene_id of the requests.")]
 
@@ -18,14 +17,13 @@ def register(app: typer.Typer) -> None:
         help="Show how stable and how accurate a server's recent forecasts were.", no_args_is_help=True
     )
     for command in (models, scene, agent, watch, reset):
-        group.command()(command)
+        group.command()(with_connection(command))
     app.add_typer(group, name="consistency")
 
 
 def models(
     *,
-    endpoint: Endpoint = DEFAULT_ENDPOINT,
-    token: Token = None,
+    connection: Connection,
     timeout: Timeout = DEFAULT_TIMEOUT,
     as_json: AsJson = False,
 ) -> None:
@@ -34,7 +32,7 @@ def models(
     from cab_forecast.show import print_models
     from cli.messages import to_json
 
-    with connect(Connection(endpoint, token, timeout)) as client:
+    with connect(connection, timeout) as client:
         listed = client.model_consistency()
     if as_json:
         typer.echo(to_json(ListModelConsistencyResponse(models=listed)))
@@ -45,8 +43,7 @@ def models(
 def scene(
     scene_id: Scene,
     *,
-    endpoint: Endpoint = DEFAULT_ENDPOINT,
-    token: Token = None,
+    connection: Connection,
     timeout: Timeout = DEFAULT_TIMEOUT,
     as_json: AsJson = False,
 ) -> None:
@@ -54,7 +51,7 @@ def scene(
     from cab_forecast.show import print_scene
     from cli.messages import to_json
 
-    with connect(Connection(endpoint, token, timeout)) as client:
+    with connect(connection, timeout) as client:
         response = client.scene_consistency(scene_id)
     if as_json:
         typer.echo(to_json(response))
@@ -69,8 +66,7 @@ def agent(
     window: Annotated[
         float | None, typer.Option(help="Seconds back from the agent's latest observation. [default: 2]")
     ] = None,
-    endpoint: Endpoint = DEFAULT_ENDPOINT,
-    token: Token = None,
+    connection: Connection,
     timeout: Timeout = DEFAULT_TIMEOUT,
     as_json: AsJson = False,
 ) -> None:
@@ -79,7 +75,7 @@ def agent(
     from cab_forecast.show import print_instants
     from cli.messages import to_json
 
-    with connect(Connection(endpoint, token, timeout)) as client:
+    with connect(connection, timeout) as client:
         instants = client.agent_consistency(scene_id, agent_id, window)
     if as_json:
         typer.echo(to_json(GetAgentConsistencyResponse(instants=instants)))
@@ -90,8 +86,7 @@ def agent(
 def watch(
     scene_id: Scene,
     *,
-    endpoint: Endpoint = DEFAULT_ENDPOINT,
-    token: Token = None,
+    connection: Connection,
     timeout: Timeout = DEFAULT_TIMEOUT,
     as_json: AsJson = False,
 ) -> None:
@@ -99,8 +94,11 @@ def watch(
     from cab_forecast.show import print_event
     from cli.messages import to_json
 
-    connection = Connection(endpoint, token, timeout)
-    with suppress(KeyboardInterrupt), connect(connection) as client, client.watch_scene(scene_id) as events:
+    with (
+        suppress(KeyboardInterrupt),
+        connect(connection, timeout) as client,
+        client.watch_scene(scene_id) as events,
+    ):
         for event in events:
             if as_json:
                 typer.echo(to_json(event))
@@ -112,8 +110,7 @@ def watch(
 def reset(
     scene_id: Scene,
     *,
-    endpoint: Endpoint = DEFAULT_ENDPOINT,
-    token: Token = None,
+    connection: Connection,
     timeout: Timeout = DEFAULT_TIMEOUT,
     as_json: AsJson = False,
 ) -> None:
@@ -121,7 +118,7 @@ def reset(
     from cab.forecast.v1.consistency_service_pb2 import ResetSceneResponse
     from cli.messages import to_json
 
-    with connect(Connection(endpoint, token, timeout)) as client:
+    with connect(connection, timeout) as client:
         agents = client.reset_scene(scene_id)
     if as_json:
         typer.echo(to_json(ResetSceneResponse(agents=agents)))

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from cli import benchmark, consistency, convert, doctor, evaluate, predict, reload, serve, train
+from cli import benchmark, consistency, convert, doctor, evaluate, keys, predict, reload, serve, train
 
 app = typer.Typer(
     name="cab-forecast",
@@ -35,6 +35,7 @@ doctor.register(app)
 predict.register(app)
 reload.register(app)
 consistency.register(app)
+keys.register(app)
 convert.register(app)
 train.register(app)
 evaluate.register(app)

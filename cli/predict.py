@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cab_forecast.endpoints import DEFAULT_ENDPOINT
-from cli.connection import DEFAULT_TIMEOUT, AsJson, Connection, Endpoint, Timeout, Token, connect
+from cli.connection import DEFAULT_TIMEOUT, AsJson, Connection, Timeout, connect, with_connection
 from cli.failures import fail
 
 if TYPE_CHECKING:
@@ -21,7 +20,7 @@ _UINT32_MAX = 2**32 - 1
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
-    app.command(name="predict")(predict)
+    app.command(name="predict")(with_connection(predict))
 
 
 def predict(
@@ -33,8 +32,7 @@ def predict(
         ),
     ],
     *,
-    endpoint: Endpoint = DEFAULT_ENDPOINT,
-    token: Token = None,
+    connection: Connection,
     timeout: Timeout = DEFAULT_TIMEOUT,
     model: Annotated[str | None, typer.Option(help="name or name@version.")] = None,
     samples: Annotated[
@@ -85,7 +83,7 @@ def predict(
             write_message(save_request, request)
             return
         outputs.check()
-        with connect(Connection(endpoint, token, timeout)) as client:
+        with connect(connection, timeout) as client:
             response = client.predict(request)
         outputs.write(request, response)
     except (OSError, ValueError, ModuleNotFoundError) as error:

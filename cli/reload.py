@@ -4,8 +4,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cab_forecast.endpoints import DEFAULT_ENDPOINT
-from cli.connection import AsJson, Connection, Endpoint, Token, connect
+from cli.connection import AsJson, Connection, connect, with_connection
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -17,13 +16,12 @@ _TIMEOUT = 120.0
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
-    app.command("reload")(reload)
+    app.command("reload")(with_connection(reload))
 
 
 def reload(
     *,
-    endpoint: Endpoint = DEFAULT_ENDPOINT,
-    token: Token = None,
+    connection: Connection,
     timeout: Annotated[
         float, typer.Option(help="Seconds to wait; the server goes on afterwards.")
     ] = _TIMEOUT,
@@ -35,7 +33,7 @@ def reload(
     """
     from cli.messages import to_json  # noqa: PLC0415
 
-    with connect(Connection(endpoint, token, timeout)) as client:
+    with connect(connection, timeout) as client:
         response = client.reload_models()
     if as_json:
         typer.echo(to_json(response))

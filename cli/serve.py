@@ -139,7 +139,11 @@ def _show_demo(server: "Server") -> None:
     from cab_forecast.demo import demo_request  # noqa: PLC0415
     from cab_forecast.show import print_forecasts  # noqa: PLC0415
 
-    tokens = server.settings.api_tokens
+    settings = server.settings
+    if settings.tls_certificate is not None or settings.keys_file is not None:
+        typer.secho("demo: not shown by a server with TLS or a file of keys", err=True)
+        return
+    tokens = settings.api_tokens
     request = demo_request()
     try:
         with Client(server.grpc_address, token=tokens[0].get_secret_value() if tokens else None) as client:

@@ -16,10 +16,13 @@ from typing import Any
 
 from redis.exceptions import RedisError
 
+from service.access.access import Access
+from service.access.gate import require_protection
 from service.predict.catalog import build_catalog
 from service.predict.models_folder import load_models, models_folder
 from service.redis_url import Layout, parse_address
 from service.settings import Settings, SettingsError, is_local, split_address
+from service.telemetry.metrics import Metrics
 from service.tracking.store.redis.connection import connect
 
 _REDIS_VERSION = 7
@@ -180,8 +183,18 @@ def _files(settings: Settings) -> Finding:
 
 
 def _protection(settings: Settings) -> Finding:
-    if settings.api_tokens:
-        return Finding("protection", Level.OK, f"{len(settings.api_tokens)} bearer tokens")
+    try:
+        require_protection(settings)
+        access = Access(settings, Metrics())
+    except SettingsError as error:
+        return Finding("protection", Level.FAIL, str(error))
+    tls = "no TLS" if access.certificates is None else "TLS"
+    if access.requires_client_certificates:
+        tls = "TLS with certificates of clients"
     if is_local(settings):
-        return Finding("protection", Level.OK, "no tokens, but only this machine can connect")
-    return Finding("protection", Level.WARN, "no tokens: everyone who reaches the ports is let in")
+        level, text = Level.OK, "only this machine can connect"
+    elif not access.gate.closed:
+        level, text = Level.WARN, "everyone who reaches the ports is let in"
+    else:
+        level, text = (Level.WARN if access.certificates is None else Level.OK), "callers need a key"
+    return Finding("protection", level, f"{text}; {tls}")

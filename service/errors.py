@@ -90,7 +90,7 @@ class Unauthenticated(ServiceError):
 
 
 class PermissionDenied(ServiceError):
-    """Error of a call that the caller may not make."""
+    """Error of a call that the caller's key does not permit."""
 
     code = "PERMISSION_DENIED"
     http_status = 403
@@ -105,6 +105,18 @@ class ReloadRefused(ServiceError):
     http_status = 409
     reason = "RELOAD_REFUSED"
     title = "Reload refused"
+
+
+class LimitExceeded(ServiceError):
+    """Error of a call beyond a limit of the caller's key."""
+
+    code = "RESOURCE_EXHAUSTED"
+    http_status = 429
+    reason = "LIMIT_EXCEEDED"
+    title = "Limit of the key exceeded"
+
+    def __init__(self, detail: str, retry_after: float) -> None:
+        super().__init__(detail, retry_after=retry_after)
 
 
 class UnknownModel(ServiceError):
@@ -236,6 +248,7 @@ TABLE: tuple[type[ServiceError], ...] = (
     Unauthenticated,
     PermissionDenied,
     ReloadRefused,
+    LimitExceeded,
     UnknownModel,
     UnknownTrack,
     TooLarge,

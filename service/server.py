@@ -9,16 +9,18 @@ from contextlib import suppress
 
 import structlog
 
+from service.access.access import Access
+from service.access.gate import require_protection
 from service.errors import ServiceError, Unavailable
 from service.predict.catalog import Models
 from service.predict.dataplane import DataPlane
 from service.predict.models_folder import load_models, models_folder
 from service.predict.reload import Load
-from service.settings import Settings, SettingsError
+from service.settings import Settings, SettingsError, is_local
 from service.telemetry.metrics import Metrics
 from service.transports.grpc.server import GrpcServer
 from service.transports.intake import Intake
-from service.transports.rest.server import HttpServer, build_app
+from service.transports.rest.server import HttpServer, build_app, build_probes
 
 _log = structlog.get_logger(__name__)
 
@@ -43,22 +45,41 @@ class Server:
         Args:
             settings: the settings.
             load: reads the models; default: the baselines and the checkpoints that the settings name.
+
+        Raises:
+            StartError: the keys or certificates are missing or broken, or anyone could call.
         """
         self.settings = settings
         self.metrics = Metrics()
+        try:
+            require_protection(settings)
+            self.access = Access(settings, self.metrics)
+        except SettingsError as error:
+            raise StartError(str(error)) from error
         self.dataplane = DataPlane(settings, self.metrics)
         self._load = load or functools.partial(_load_models, settings)
         self.intake = Intake(settings, self.metrics)
-        self._grpc = GrpcServer(self.dataplane, self.metrics, settings, self.intake)
-        self._http = HttpServer(build_app(self.dataplane, self.metrics, settings, self.intake), settings)
+        self._grpc = GrpcServer(self.dataplane, self.metrics, settings, self.intake, self.access)
+        app = build_app(self.dataplane, self.metrics, settings, self.intake, self.access.gate)
+        self._http = HttpServer(app, settings.http, settings, self.access.certificates)
+        self._probes = (
+            None
+            if settings.probes is None
+            else HttpServer(build_probes(self.dataplane), settings.probes, settings)
+        )
         self._signalled = asyncio.Event()
-        self._following: asyncio.Task[None] | None = None
+        self._following: list[asyncio.Task[None]] = []
         self._reloading: asyncio.Task[None] | None = None
 
     @property
     def http_address(self) -> str:
         """HOST:PORT of REST, once started."""
         return self._http.address
+
+    @property
+    def probes_address(self) -> str:
+        """HOST:PORT of the port for probes, once started; empty if there is none."""
+        return "" if self._probes is None else self._probes.address
 
     @property
     def grpc_address(self) -> str:
@@ -82,7 +103,10 @@ class Server:
             await self.stop(drain=False)
             raise
         self._grpc.set_serving(not self._signalled.is_set())
-        self._following = asyncio.create_task(self._follow_readiness(), name="readiness")
+        self._following += [
+            asyncio.create_task(self._follow_readiness(), name="readiness"),
+            asyncio.create_task(self.access.follow(), name="access"),
+        ]
         _log.info(
             "ready",
             http=self.http_address,
@@ -100,8 +124,8 @@ class Server:
             drain: False: do not wait for accepted calls.
         """
         started = time.perf_counter()
-        if self._following is not None:
-            self._following.cancel()
+        for task in self._following:
+            task.cancel()
         self.dataplane.refuse()
         self._grpc.set_serving(False)
         grace = 0.0
@@ -109,7 +133,7 @@ class Server:
             _log.info("draining")
             await self.dataplane.drain(self.settings.drain_seconds)
             grace = max(started + self.settings.drain_seconds - time.perf_counter(), 0.0)
-        await asyncio.gather(self._grpc.stop(grace), self._http.stop(grace))
+        await asyncio.gather(self._grpc.stop(grace), *(server.stop(grace) for server in self._http_servers()))
         await self.dataplane.close()
         _log.info("stopped", seconds=round(time.perf_counter() - started, 3))
 
@@ -187,14 +211,27 @@ class Server:
             await self._grpc.start()
         except OSError as error:
             raise StartError(f"grpc: cannot listen on {self.settings.grpc}; is it taken?") from error
-        try:
-            await self._http.start()
-        except OSError as error:
-            raise StartError(
-                f"http: cannot listen on {self.settings.http}: {error.strerror or error}"
-            ) from error
-        authentication = "bearer tokens" if self.settings.api_tokens else "off: every caller is accepted"
-        _log.info("listening", http=self.http_address, grpc=self.grpc_address, authentication=authentication)
+        for server in self._http_servers():
+            try:
+                await server.start()
+            except OSError as error:
+                name = "http" if server is self._http else "probes"
+                raise StartError(
+                    f"{name}: cannot listen on {getattr(self.settings, name)}: {error.strerror or error}"
+                ) from error
+        closed, secure = self.access.gate.closed, self.access.certificates is not None
+        _log.info(
+            "listening",
+            http=self.http_address,
+            grpc=self.grpc_address,
+            authentication="keys" if closed else "off: every caller is accepted",
+            tls=("mutual" if self.access.requires_client_certificates else "on") if secure else "off",
+        )
+        if closed and not secure and not is_local(self.settings):
+            _log.warning("keys arrive unencrypted, unless a proxy in front of the server ends TLS")
+
+    def _http_servers(self) -> list[HttpServer]:
+        return [self._http] if self._probes is None else [self._http, self._probes]
 
 
 def _load_models(settings: Settings, current: Models | None) -> Models:

@@ -2,6 +2,7 @@
 
 import ipaddress
 import os
+import re
 from collections.abc import Collection, Sequence
 from enum import StrEnum
 from pathlib import Path
@@ -20,6 +21,7 @@ from pydantic_settings import (
 from service.environment import CONFIG, PREFIX, no_such_setting, unknown_variable
 from service.redis_url import parse_address
 
+_ORIGIN = re.compile(r"https?://[^/\s]+|\*")
 FALLBACK_MODEL = "constant-velocity-yaw"
 """Model that forecasts the agents that the requested model cannot forecast."""
 
@@ -75,8 +77,29 @@ class Settings(BaseSettings):
     allow_paper_protocol: bool = False
     """Flag for loading models trained by the paper protocol, which warn in every response. Otherwise they are
     skipped, and a folder without other models is refused."""
+
+    keys_file: Path | None = None
+    """File of API keys, see ``cab-forecast keys``; a change takes effect within seconds. None: no keys."""
     api_tokens: Annotated[tuple[SecretStr, ...], NoDecode] = ()
-    """Accepted bearer tokens, comma-separated in the environment; not set: every caller is accepted."""
+    """Further accepted keys, without names and limits, and with all scopes; comma-separated in the
+    environment."""
+    allow_anyone: bool = False
+    """Flag for listening on addresses that other machines can reach although neither ``keys_file`` nor
+    ``api_tokens`` is set. Without keys every caller is accepted."""
+    tls_certificate: Path | None = None
+    """PEM file of the server's certificate and those between it and its authority, for both ports; a change
+    takes effect within seconds. None: no TLS."""
+    tls_key: Path | None = None
+    """PEM file of the certificate's private key, without a password."""
+    tls_client_ca: Path | None = None
+    """PEM file of the authorities whose certificates clients must present on both ports; None: clients need
+    no certificate."""
+    probes: str | None = None
+    """HOST:PORT of a further port without TLS for /livez and /readyz alone, for probes that cannot present a
+    certificate; port 0: any free port; None: no such port."""
+    cors_origins: Annotated[tuple[str, ...], NoDecode] = ()
+    """Origins whose web pages may call REST, for example ``https://tools.example.com``; comma-separated in
+    the environment; not set: no pages of other origins may."""
 
     max_agents: int = Field(default=512, ge=1)
     """Max number of agents of a request."""
@@ -131,10 +154,18 @@ class Settings(BaseSettings):
     log_json: bool = False
     """Logs as JSON lines."""
 
-    @field_validator("http", "grpc")
+    @field_validator("http", "grpc", "probes")
     @classmethod
-    def _is_address(cls, value: str) -> str:
-        split_address(value)
+    def _is_address(cls, value: str | None) -> str | None:
+        if value is not None:
+            split_address(value)
+        return value
+
+    @field_validator("keys_file", "tls_certificate", "tls_key", "tls_client_ca", mode="before")
+    @classmethod
+    def _names_a_file(cls, value: object) -> object:
+        if value == "":
+            raise ValueError("is set but names no file; leave it out if there is none")
         return value
 
     @field_validator("store")
@@ -178,10 +209,33 @@ class Settings(BaseSettings):
             pairs[key] = model
         return pairs
 
+    @field_validator("cors_origins", mode="before")
+    @classmethod
+    def _split_origins(cls, value: object) -> object:
+        if isinstance(value, str):
+            return tuple(origin.strip() for origin in value.split(",") if origin.strip())
+        return value
+
+    @field_validator("cors_origins")
+    @classmethod
+    def _are_origins(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        for origin in value:
+            if _ORIGIN.fullmatch(origin) is None:
+                raise ValueError(f'"{origin}" is no origin such as https://tools.example.com')
+        return value
+
     @field_validator("log_level", mode="before")
     @classmethod
     def _lower_level(cls, value: object) -> object:
         return value.lower() if isinstance(value, str) else value
+
+    @model_validator(mode="after")
+    def _tls_is_complete(self) -> Self:
+        if (self.tls_certificate is None) != (self.tls_key is None):
+            raise ValueError("tls_certificate and tls_key go together: both are needed for TLS")
+        if self.tls_client_ca is not None and self.tls_certificate is None:
+            raise ValueError("tls_client_ca needs tls_certificate and tls_key as well")
+        return self
 
     @model_validator(mode="after")
     def _queue_takes_a_call(self) -> Self:
@@ -320,14 +374,16 @@ def split_shadow(shadow: str) -> tuple[str, float]:
 
 def is_local(settings: Settings) -> bool:
     """Return whether both ports listen on this machine's loopback alone."""
-    return all(_is_loopback(split_address(address)[0]) for address in (settings.http, settings.grpc))
+    return is_loopback(settings.http) and is_loopback(settings.grpc)
 
 
-def _is_loopback(host: str) -> bool:
+def is_loopback(address: str) -> bool:
+    """Return whether HOST:PORT can be reached from this machine alone."""
+    host, _ = split_address(address)
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
-        return host == "localhost"
+        return host == "localhost"  # what other names mean is up to a resolver
 
 
 def bundled_models() -> Path | None:

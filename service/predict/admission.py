@@ -16,6 +16,7 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from operator import attrgetter
 
+from service.access.caller import Grant
 from service.errors import DeadlineExceeded, Overloaded
 from service.predict.scheduler import CostModel, Order
 from service.telemetry.metrics import Metrics
@@ -74,6 +75,8 @@ class Call:
         """Number of queue places held."""
         self.caller: str | None = None
         """Name of the caller's key; None: there is none."""
+        self.grant: Grant | None = None
+        """Counter of the request's agents against the limits of the key; None: there are no limits."""
         self.when_sent: Callable[[], None] | None = None
         """Function to call once the response has been sent; None: there is none."""
         self.is_trial = False

@@ -8,7 +8,7 @@ import structlog
 
 from cab.forecast.v1 import admin_service_pb2 as admin_pb
 from cab.forecast.v1 import model_service_pb2 as pb
-from service.errors import BadField, PermissionDenied, Unavailable
+from service.errors import BadField, Unavailable
 from service.lifecycle import Lifecycle, Phase
 from service.predict.admission import Admission
 from service.predict.batcher import Batcher
@@ -17,7 +17,7 @@ from service.predict.pipeline import Pipeline
 from service.predict.reload import Load, Reloader
 from service.predict.shadow import Shadow
 from service.predict.torch_threads import set_helper_threads
-from service.settings import Settings, is_local, split_shadow
+from service.settings import Settings, split_shadow
 from service.telemetry.metrics import Metrics
 from service.tracking.collector import ConsistencyCollector, StoreMetrics
 from service.tracking.model_references import ModelReferences
@@ -127,13 +127,10 @@ class DataPlane:
         """Read the models again; a caller that goes away does not end it.
 
         Raises:
-            PermissionDenied: the caller may not administer the server.
             ReloadRefused: the new models as a whole cannot be served; nothing has changed.
             Unavailable: the server is not ready.
         """
         self._lifecycle.require_ready()
-        if not (self._settings.api_tokens or is_local(self._settings)):
-            raise PermissionDenied("without tokens, admin calls are answered on a loopback address only")
         return await self.reload()
 
     async def reload(self) -> admin_pb.ReloadModelsResponse:

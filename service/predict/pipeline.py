@@ -15,6 +15,7 @@ import structlog
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.forecaster import Forecaster
 from model.scenes.resample import history_seconds
+from service.access.caller import Grant
 from service.lifecycle import Lifecycle
 from service.predict.admission import Admission, Call
 from service.predict.batcher import Batcher
@@ -85,11 +86,13 @@ class Pipeline:
         metrics.begin_input_warnings(code_names())
 
     @contextmanager
-    def accept(self, timeout: float | None = None) -> Iterator[Call]:
+    def accept(self, timeout: float | None = None, grant: Grant | None = None) -> Iterator[Call]:
         """Accept a call on its arrival, before its body is read; a drain waits for the end of the block.
 
         Args:
             timeout: the client's timeout, s; the server's own limit applies as well.
+            grant: counts the agents of the request against the limits of the caller's key; None: there are
+                no limits.
 
         Raises:
             Unavailable: the server is not ready.
@@ -99,6 +102,8 @@ class Pipeline:
         limit = self._settings.max_timeout
         seconds = limit if timeout is None else min(timeout, limit)
         call = self._admission.admit(asyncio.get_running_loop().time() + seconds)
+        if grant is not None:
+            call.caller, call.grant = grant.caller.name, grant
         with self._lifecycle.in_progress():
             yield call
         if call.when_sent is not None:
@@ -123,6 +128,8 @@ class Pipeline:
         async with call.in_time():
             # Decode
             message = await self._reader.read(request) if isinstance(request, EncodedRequest) else request
+            if call.grant is not None:
+                call.grant.charge(len(message.agents))
             # Validate
             catalog = self.catalog  # of the whole call, even if other models take over meanwhile
             forecaster = catalog.get(message.model, call.caller)

@@ -16,6 +16,7 @@ from prometheus_client import (
 )
 
 from model.forecaster import ModelInfo, Protocol
+from service.telemetry.key_metrics import KeyMetrics
 
 _SECONDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 _AGENTS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
@@ -116,6 +117,7 @@ class Metrics:
         )
         for reason in ("queue_full", "late", "dropped", "displaced", "concurrency", "bytes", "watchers"):
             self.refused.labels(reason)
+        self.keys = KeyMetrics(self.registry)
         self.model_info = Gauge(
             "forecast_model_info",
             "1 for each loaded model.",
@@ -183,6 +185,8 @@ class Metrics:
             yield call
         finally:
             self.requests.labels(transport, method, call.code).inc()
+            if call.key is not None:
+                self.keys.count(call.key, call.code)
             if timed:
                 self.request_duration.labels(transport, method).observe(perf_counter() - started)
 
@@ -206,3 +210,5 @@ class Call:
     def __init__(self) -> None:
         self.code = "CANCELLED"
         """Canonical status code; it stays CANCELLED if the client disconnects first."""
+        self.key: str | None = None
+        """Name of the API key; None: there is none, or it was not accepted."""

@@ -17,6 +17,7 @@ from cab.forecast.v1.routes import (
     RESET_SCENE,
     Route,
 )
+from service.access.caller import Caller
 from service.errors import BadField, Internal, ServiceError
 from service.predict.dataplane import DataPlane
 from service.telemetry.metrics import Call, Metrics
@@ -44,6 +45,10 @@ class CallRecorder:
         self._transport = transport
         self._method = method
         self._call = call
+
+    def identified(self, caller: Caller) -> None:
+        """Record whose call it is."""
+        self._call.key = caller.name
 
     def succeeded(self) -> None:
         """Record a call that was answered."""

@@ -23,6 +23,7 @@ from cab_forecast import (
     InternalError,
     NotFound,
     Overloaded,
+    PermissionDenied,
     TooLarge,
     Unauthenticated,
     Unavailable,
@@ -242,7 +243,7 @@ def test_paths_of_a_gateway_are_kept(call_at: Call, script: Script) -> None:
     ("status", "kind", "reason"),
     [
         (400, BadRequest, ""),
-        (403, Unauthenticated, ""),
+        (403, PermissionDenied, ""),
         (413, TooLarge, "TOO_LARGE"),
         (429, Overloaded, ""),
         (502, Unavailable, ""),

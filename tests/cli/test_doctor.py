@@ -6,12 +6,14 @@ import socket
 from pathlib import Path
 
 import pytest
+import trustme
 from typer.testing import CliRunner
 
 from cli.main import app
 from loadtest.redis_servers import single
 from service.doctor import usable_cores
 from tests.model.checkpoints import copy_bundled
+from tests.service.certificates import write_certificate
 from tests.service.tracking.store.stores import require_redis
 
 SMALL = "trajectron-no-context"
@@ -91,10 +93,27 @@ def test_surroundings_that_are_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found["http"] == [("FAIL", f"cannot listen on 127.0.0.1:{port}: Address already in use")]
     assert found["store"][0][0] == "FAIL"
     assert "does not answer" in found["store"][0][1]
-    assert {check for check, ((level, _), *_) in found.items() if level == "WARN"} >= {
-        "threads",
-        "protection",
-    }
+    assert found["threads"][0][0] == "WARN"
+    [(level, text)] = found["protection"]
+    assert level == "FAIL"
+    assert "FORECAST_ALLOW_ANYONE" in text
+
+
+def test_protection(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    assert run(0)["protection"] == [("OK", "only this machine can connect; no TLS")]
+    monkeypatch.setenv("FORECAST_HTTP", "0.0.0.0:0")
+    monkeypatch.setenv("FORECAST_ALLOW_ANYONE", "true")
+    assert run(0)["protection"] == [("WARN", "everyone who reaches the ports is let in; no TLS")]
+    monkeypatch.setenv("FORECAST_API_TOKENS", "token")
+    assert run(0)["protection"] == [("WARN", "callers need a key; no TLS")]
+    chain, key = write_certificate(trustme.CA(), tmp_path, "server")
+    monkeypatch.setenv("FORECAST_TLS_CERTIFICATE", str(chain))
+    monkeypatch.setenv("FORECAST_TLS_KEY", str(key))
+    assert run(0)["protection"] == [("OK", "callers need a key; TLS")]
+    key.write_text("")
+    [(level, text)] = run(1)["protection"]
+    assert level == "FAIL"
+    assert text.startswith("tls: ")
 
 
 def test_a_redis_that_answers(monkeypatch: pytest.MonkeyPatch) -> None:

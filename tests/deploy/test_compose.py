@@ -7,8 +7,9 @@ import pytest
 import yaml
 
 from loadtest.redis_servers import single
+from service.access.gate import require_protection
 from service.environment import PREFIX
-from service.settings import Settings, load, split_address
+from service.settings import Settings, SettingsError, load, split_address
 from tests.deploy.files import DEPLOY, ROOT, job_name, read_yaml
 from tests.service.tracking.store.stores import opened, require_redis, scene_name
 from tests.service.tracking.store.track_updates import START, track_update
@@ -47,12 +48,29 @@ def test_the_image_listens_where_it_says(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_variables_of_the_compose_file_are_settings(monkeypatch: pytest.MonkeyPatch) -> None:
     forecast = SERVICES["forecast"]
     assert {int(port.rpartition(":")[2]) for port in forecast["ports"]} == image_ports()
-    settings = settings_of(monkeypatch, forecast["environment"])
+    given = {name: value for name, value in forecast["environment"].items() if value is not None}
+    passed_on = forecast["environment"].keys() - given.keys()
+    assert {name.removeprefix(PREFIX).lower() for name in passed_on} <= Settings.model_fields.keys()
+    assert {f"{PREFIX}KEYS_FILE", f"{PREFIX}ALLOW_ANYONE"} <= passed_on
+    settings = settings_of(monkeypatch, given)
     assert settings.store == "redis://redis:6379"
     [(dependency, how)] = forecast["depends_on"].items()
     assert dependency in SERVICES
     assert how == {"condition": "service_healthy", "required": False}
     assert int(forecast["stop_grace_period"].removesuffix("s")) > settings.drain_seconds
+
+
+def test_the_image_demands_keys_or_the_word(monkeypatch: pytest.MonkeyPatch) -> None:
+    image = settings_of(monkeypatch, {})
+    with pytest.raises(SettingsError, match=r"FORECAST_KEYS_FILE, or set FORECAST_ALLOW_ANYONE=true"):
+        require_protection(image)
+    require_protection(settings_of(monkeypatch, {f"{PREFIX}ALLOW_ANYONE": "true"}))
+    manifest = settings_of(monkeypatch, {each["name"]: each["value"] for each in CONTAINER["env"]})
+    [mount] = CONTAINER["volumeMounts"]
+    assert manifest.keys_file is not None
+    assert str(manifest.keys_file.parent) == mount["mountPath"]
+    assert image.probes is not None
+    assert f"http://{image.probes}/readyz" in (ROOT / "Dockerfile").read_text()
 
 
 def test_every_service_is_pinned_and_without_rights() -> None:

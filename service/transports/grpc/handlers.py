@@ -20,12 +20,14 @@ from grpc import aio
 
 from cab.forecast.v1.consistency_service_pb2 import WatchSceneRequest
 from cab.forecast.v1.routes import PREDICT, SERVICES, WATCH_SCENE, Request, Response, Route
+from service.access.caller import Grant
 from service.errors import TooLarge
 from service.predict.dataplane import DataPlane
 from service.predict.request_reader import LARGE_BYTES, EncodedRequest, RequestLimits, read_protobuf
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
 from service.transports.calls import UNARY_METHODS, parse_message, record_call
+from service.transports.grpc.gate import current_caller
 from service.transports.grpc.intake import Incoming
 from service.transports.grpc.status import abort
 from service.transports.streams import closing
@@ -58,9 +60,9 @@ class Handlers:
             for service in SERVICES
         ]
 
-    async def _predict(self, incoming: Incoming, context: Context) -> Message:
+    async def _predict(self, incoming: Incoming, grant: Grant, context: Context) -> Message:
         # The call counts as in progress until the response was sent, not only until this returns.
-        call = incoming.hold(self._dataplane.accept(context.time_remaining()))
+        call = incoming.hold(self._dataplane.accept(context.time_remaining(), grant))
         body = await self._read(incoming)
         return await self._dataplane.predict(EncodedRequest(body, self._read_request, LARGE_BYTES), call)
 
@@ -68,14 +70,14 @@ class Handlers:
         return self._dataplane.consistency.watch_scene(request)
 
     def _bytes(
-        self, route: Route[Any, Any], behavior: Callable[[Incoming, Context], Awaitable[Message]]
+        self, route: Route[Any, Any], behavior: Callable[[Incoming, Grant, Context], Awaitable[Message]]
     ) -> "grpc.RpcMethodHandler[bytes, bytes]":
         """Return the handler of a method that reads and parses its request itself."""
 
         async def handle(incoming: Incoming, context: Context) -> bytes:
             async with self._recorded(route, context):
-                incoming.accept()
-                return (await behavior(incoming, context)).SerializeToString()
+                grant = incoming.accept(current_caller())
+                return (await behavior(incoming, grant, context)).SerializeToString()
 
         return _handler(grpc.unary_unary_rpc_method_handler, handle)
 
@@ -84,7 +86,7 @@ class Handlers:
     ) -> "grpc.RpcMethodHandler[bytes, bytes]":
         """Return the handler of a method with small requests."""
 
-        async def parse_and_execute(incoming: Incoming, _: Context) -> Message:
+        async def parse_and_execute(incoming: Incoming, _: Grant, __: Context) -> Message:
             return await behavior(parse_message(route.request, await self._read(incoming)))
 
         return self._bytes(route, parse_and_execute)
@@ -97,7 +99,7 @@ class Handlers:
         async def handle(incoming: Incoming, context: Context) -> None:
             async with self._recorded(route, context):
                 events = behavior(parse_message(route.request, await self._read(incoming)))
-                async with closing(events):
+                async with current_caller().stream(), closing(events):
                     async for event in events:
                         await _send(context, event)
 
@@ -114,6 +116,7 @@ class Handlers:
     async def _recorded(self, route: Route[Any, Any], context: Context) -> AsyncIterator[None]:
         """Record a call, and turn exceptions into a status with details."""
         with record_call(self._metrics, "grpc", route.method, timed=not route.streaming) as recorder:
+            recorder.identified(current_caller())
             try:
                 yield
             except Exception as exception:

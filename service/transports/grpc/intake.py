@@ -15,9 +15,11 @@ from typing import Any, TypeVar
 import grpc
 from grpc import aio
 
+from service.access.caller import Caller, Grant
 from service.errors import BadField, RequestTimeout, ServiceError
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
+from service.transports.grpc.gate import CONTRACT
 from service.transports.grpc.status import abort
 from service.transports.intake import Intake
 
@@ -27,7 +29,6 @@ details. Beyond it gRPC itself refuses, with the same code but without details."
 SLOW_SECONDS = 1.0
 """Seconds after which a request that has not arrived counts as one of the largest size, because gRPC does not
 tell how much of it has been received."""
-_CONTRACT = "/cab."
 
 _Handler = grpc.RpcMethodHandler
 _Context = Any  # generic in the message types
@@ -53,13 +54,16 @@ class Incoming:
         """Enter a context that ends when the response has been sent."""
         return self._stack.enter_context(counted)
 
-    def accept(self) -> None:
-        """Count the call against the bound of calls.
+    def accept(self, caller: Caller) -> Grant:
+        """Count the call against the limits of its caller, then against the bound of all calls.
 
         Raises:
+            LimitExceeded: the caller's key has reached a limit.
             Overloaded: there are too many calls.
         """
+        grant = self.hold(caller.call())
         self.hold(self._intake.call())
+        return grant
 
     def send_in_time(self) -> None:
         """Let the call count no longer than the write timeout from now on: its response is being sent.
@@ -127,7 +131,7 @@ class IntakeInterceptor(aio.ServerInterceptor):  # type: ignore[type-arg]  # gen
         handler = await continuation(handler_call_details)
         if handler is None or handler.request_streaming:
             return handler
-        in_contract = handler_call_details.method.startswith(_CONTRACT)
+        in_contract = handler_call_details.method.startswith(CONTRACT)
         behavior: Any = handler.unary_stream if handler.response_streaming else handler.unary_unary
 
         async def handle(_: object, context: _Context) -> Any:

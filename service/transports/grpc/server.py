@@ -1,6 +1,5 @@
 """gRPC server: the contract's services, health and reflection on one port."""
 
-from collections.abc import Awaitable, Callable
 from typing import Any
 
 import grpc
@@ -9,15 +8,15 @@ from grpc_health.v1 import health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from cab.forecast.v1.routes import SERVICES
-from service.errors import Unauthenticated
+from service.access.access import Access
+from service.access.tls import Certificates
 from service.predict.dataplane import DataPlane
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
-from service.transports.auth import Tokens
+from service.transports.grpc.gate import GateInterceptor
 from service.transports.grpc.handlers import Handlers
 from service.transports.grpc.health import HEALTH_SERVICE, Health
 from service.transports.grpc.intake import RECEIVE_MARGIN, IntakeInterceptor
-from service.transports.grpc.status import abort
 from service.transports.intake import Intake
 
 _UNLIMITED = -1
@@ -28,18 +27,19 @@ _KEEPALIVE = (
     ("grpc.http2.max_pings_without_data", 0),  # unlimited
     ("grpc.http2.min_ping_interval_without_data_ms", 10_000),  # for clients that send keepalive pings too
 )
-_OPEN = ("/grpc.health.v1.Health/",)
-"""Methods that need no credentials, because orchestrators probe without."""
 
 
 class GrpcServer:
     """The gRPC server, with the contract's services, health and reflection."""
 
-    def __init__(self, dataplane: DataPlane, metrics: Metrics, settings: Settings, intake: Intake) -> None:
+    def __init__(
+        self, dataplane: DataPlane, metrics: Metrics, settings: Settings, intake: Intake, access: Access
+    ) -> None:
         self._settings = settings
+        self._access = access
         self._server = aio.server(
             interceptors=[
-                AuthInterceptor(Tokens(settings.api_tokens), metrics),
+                GateInterceptor(access.gate, metrics),
                 IntakeInterceptor(intake, metrics, settings),
             ],
             options=[
@@ -67,7 +67,12 @@ class GrpcServer:
         """
         host = self._settings.grpc.rpartition(":")[0]
         try:
-            port = self._server.add_insecure_port(self._settings.grpc)
+            credentials = _credentials(self._access)
+            port = (
+                self._server.add_insecure_port(self._settings.grpc)
+                if credentials is None
+                else self._server.add_secure_port(self._settings.grpc, credentials)
+            )
         except RuntimeError as error:
             raise OSError(str(error)) from error
         self.address = f"{host}:{port}"
@@ -87,44 +92,25 @@ class GrpcServer:
         await self._server.stop(grace)
 
 
-class AuthInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[type-arg]  # generic in the stubs only
-    """Interceptor that refuses calls without a valid bearer token."""
+def _credentials(access: Access) -> grpc.ServerCredentials | None:
+    """Return credentials with the certificates as they are when a client connects; None: there is no TLS."""
+    certificates = access.certificates
+    if certificates is None:
+        return None
+    sent = certificates.value
 
-    def __init__(self, tokens: Tokens, metrics: Metrics) -> None:
-        self._tokens = tokens
-        self._metrics = metrics
+    def changed() -> Any:  # the stubs lack None, which means: go on with those that were sent
+        nonlocal sent
+        if certificates.value is sent:
+            return None
+        sent = certificates.value
+        return _configuration(sent)
 
-    async def intercept_service(
-        self,
-        continuation: Callable[[grpc.HandlerCallDetails], Awaitable["grpc.RpcMethodHandler[Any, Any]"]],
-        handler_call_details: grpc.HandlerCallDetails,
-    ) -> "grpc.RpcMethodHandler[Any, Any]":
-        """Return the method's handler, or one that refuses the call."""
-        method = handler_call_details.method
-        if method.startswith(_OPEN):
-            return await continuation(handler_call_details)
-        metadata = dict(handler_call_details.invocation_metadata)
-        header = metadata.get("authorization")
-        try:
-            self._tokens.check(header if isinstance(header, str) else None)
-        except Unauthenticated as error:
-            handler = await continuation(handler_call_details)
-            return handler if handler is None else self._refusal(handler, error, method)
-        return await continuation(handler_call_details)
+    return grpc.dynamic_ssl_server_credentials(
+        _configuration(sent), changed, require_client_authentication=access.requires_client_certificates
+    )
 
-    def _refusal(
-        self, handler: "grpc.RpcMethodHandler[Any, Any]", error: Unauthenticated, method: str
-    ) -> "grpc.RpcMethodHandler[Any, Any]":
-        name = method.rpartition("/")[2] if method.startswith("/cab.") else "other"
 
-        async def refuse(_: object, context: Any) -> None:
-            with self._metrics.call("grpc", name) as call:
-                call.code = error.code
-                await abort(context, error)
-
-        # The refusal must have the arity of the method that it replaces: some of them stream.
-        if handler.request_streaming:
-            return grpc.stream_stream_rpc_method_handler(refuse)
-        if handler.response_streaming:
-            return grpc.unary_stream_rpc_method_handler(refuse)
-        return grpc.unary_unary_rpc_method_handler(refuse)
+def _configuration(certificates: Certificates) -> grpc.ServerCertificateConfiguration:
+    pair = (certificates.key, certificates.chain)
+    return grpc.ssl_server_certificate_configuration([pair], certificates.client_ca)

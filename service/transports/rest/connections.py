@@ -5,9 +5,9 @@ grow, for as long as their clients want.
 """
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Sized
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
@@ -15,6 +15,12 @@ MAX_HEADER_BYTES = 64 * 2**10
 """Max size of the headers of a request."""
 _LINGER = 1.0
 """Seconds after the body timeout in which the call itself can answer."""
+
+
+class HasTransport(Protocol):
+    """Connection that can be aborted."""
+
+    transport: asyncio.Transport
 
 
 @dataclass
@@ -30,6 +36,22 @@ class Connections:
     """Seconds for which a client may leave a full buffer of its response unread."""
     waiting: "dict[BoundedProtocol, None]" = field(default_factory=dict)
     """Connections without a request in progress, longest waiting first."""
+    handshakes: "dict[HasTransport, None]" = field(default_factory=dict)
+    """Connections whose TLS handshake is not done, oldest first."""
+
+    def make_room(self, connections: Sized) -> None:
+        """Close a connection if there are too many: the oldest handshake, else the one that waits longest.
+
+        Args:
+            connections: those whose handshake is done.
+        """
+        if len(connections) + len(self.handshakes) <= self.max_connections:
+            return
+        oldest = self.handshakes or self.waiting
+        for connection in oldest:
+            del oldest[connection]  # type: ignore[arg-type]  # it is of this dictionary
+            connection.transport.abort()
+            break
 
 
 class BoundedProtocol(HttpToolsProtocol):
@@ -52,10 +74,7 @@ class BoundedProtocol(HttpToolsProtocol):
         super().connection_made(transport)
         self._limits.waiting[self] = None
         self._set_timer(self._limits.header_timeout, self._on_header_timeout)
-        if len(self.connections) > self._limits.max_connections:
-            oldest = next(iter(self._limits.waiting))
-            del self._limits.waiting[oldest]
-            oldest.transport.abort()
+        self._limits.make_room(self.connections)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Stop waiting."""

@@ -13,12 +13,14 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from cab.forecast.v1.routes import MODEL_SERVICE, PREDICT, WATCH_SCENE, Route
+from service.access.caller import Grant
+from service.access.gate import Gate
+from service.access.scopes import scope_of
 from service.errors import RequestTimeout, TooLarge
 from service.predict.dataplane import DataPlane
 from service.predict.request_reader import LARGE_BYTES, EncodedRequest, RequestLimits, read_protobuf
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
-from service.transports.auth import Tokens
 from service.transports.calls import UNARY_METHODS, CallRecorder, parse_message, record_call
 from service.transports.intake import Intake
 from service.transports.rest.codec import parse_json, read_query, read_request, to_json
@@ -45,17 +47,20 @@ _EXIT_STACK = "forecast.exit_stack"
 
 _T = TypeVar("_T")
 Endpoint = Callable[[Request], Awaitable[Response]]
+Behavior = Callable[[Request, Grant], Awaitable[Response]]
 
 
 class Endpoints:
     """The contract's methods as Starlette endpoints."""
 
-    def __init__(self, dataplane: DataPlane, metrics: Metrics, settings: Settings, intake: Intake) -> None:
+    def __init__(
+        self, dataplane: DataPlane, metrics: Metrics, settings: Settings, intake: Intake, gate: Gate
+    ) -> None:
         self._intake = intake
+        self._gate = gate
         self._body_timeout = settings.body_timeout
         self._dataplane = dataplane
         self._metrics = metrics
-        self._tokens = Tokens(settings.api_tokens)
         self._max_bytes = settings.max_request_bytes
         self._limits = RequestLimits.from_settings(settings)
 
@@ -69,15 +74,19 @@ class Endpoints:
             endpoints[route] = self._recorded(route, functools.partial(self._execute, route))
         return endpoints
 
-    def _recorded(self, route: Route[Any, Any], behavior: Endpoint) -> Endpoint:
+    def _recorded(self, route: Route[Any, Any], behavior: Behavior) -> Endpoint:
         """Return an endpoint that authenticates, records the call, and responds to errors with a problem."""
 
         async def endpoint(request: Request) -> Response:
             with record_call(self._metrics, "rest", route.method) as recorder:
                 try:
-                    self._tokens.check(request.headers.get("authorization"))
+                    caller = self._gate.identify(request.headers.get("authorization"))
+                    recorder.identified(caller)
+                    caller.require(scope_of(route))
+                    # Before the bounds that all share: what is beyond a key's own must not use them up
+                    grant = exit_stack(request).enter_context(caller.call())
                     exit_stack(request).enter_context(self._intake.call())
-                    response = await behavior(request)
+                    response = await behavior(request, grant)
                 except ClientDisconnect:
                     recorder.cancelled()
                     return Response(status_code=_CLIENT_CLOSED_REQUEST)
@@ -88,11 +97,11 @@ class Endpoints:
 
         return endpoint
 
-    async def _predict(self, request: Request) -> Response:
+    async def _predict(self, request: Request, grant: Grant) -> Response:
         incoming = request_format(request.headers)
         outgoing = response_format(request.headers, preferred=incoming)
         # The call counts as in progress until the response was sent, not only until this returns.
-        call = exit_stack(request).enter_context(self._dataplane.accept(timeout(request.headers)))
+        call = exit_stack(request).enter_context(self._dataplane.accept(timeout(request.headers), grant))
         async with call.in_time():
             body = await self._read_body(request, self._max_bytes)
         if incoming is Format.JSON:  # always slow enough to be parsed in a thread
@@ -105,7 +114,7 @@ class Endpoints:
             return _message_response(message, outgoing)
         return await asyncio.to_thread(_message_response, message, outgoing)
 
-    async def _execute(self, route: Route[Any, Any], request: Request) -> Response:
+    async def _execute(self, route: Route[Any, Any], request: Request, _: Grant) -> Response:
         """Execute a unary method with small messages."""
         incoming = request_format(request.headers) if route.verb == "POST" else Format.JSON
         outgoing = response_format(request.headers, preferred=incoming)
@@ -124,7 +133,7 @@ class Endpoints:
             message = read_query(WATCH_SCENE.request, request.query_params)
             return self._dataplane.consistency.watch_scene(message)
 
-        return EventStreamResponse(self._metrics, self._tokens, WATCH_SCENE.method, request, events)
+        return EventStreamResponse(self._metrics, self._gate, WATCH_SCENE, request, events)
 
     async def _read_body(self, request: Request, max_bytes: int) -> bytes:
         """Return the body; refuse one that is too large as soon as that is known.
@@ -167,8 +176,8 @@ class EventStreamResponse(Response):
     def __init__(
         self,
         metrics: Metrics,
-        tokens: Tokens,
-        method: str,
+        gate: Gate,
+        route: Route[Any, Any],
         request: Request,
         events: Callable[[], AsyncIterator[Message]],
     ) -> None:
@@ -176,22 +185,22 @@ class EventStreamResponse(Response):
 
         Args:
             metrics: records the call.
-            tokens: authenticate it.
-            method: name of the contract's method.
+            gate: authenticates the caller.
+            route: the contract's method.
             request: the HTTP request.
             events: opens the stream of messages; the headers are sent with the first one.
         """
         self.status_code = 200
         self.init_headers(_EVENT_HEADERS)
         self._metrics = metrics
-        self._tokens = tokens
-        self._method = method
+        self._gate = gate
+        self._route = route
         self._request = request
         self._events = events
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve the request to its end."""
-        with record_call(self._metrics, "rest", self._method, timed=False) as recorder:
+        with record_call(self._metrics, "rest", self._route.method, timed=False) as recorder:
             writer = _BodyWriter(send, self.raw_headers)
             try:
                 problem = await cancel_on_disconnect(receive, self._serve(recorder, writer))
@@ -204,7 +213,11 @@ class EventStreamResponse(Response):
     async def _serve(self, recorder: CallRecorder, writer: "_BodyWriter") -> Response | None:
         """Send all events. Return a problem response if the call fails before the first one."""
         try:
-            await self._send_events(writer)
+            caller = self._gate.identify(self._request.headers.get("authorization"))
+            recorder.identified(caller)
+            caller.require(scope_of(self._route))
+            async with caller.stream():
+                await self._send_events(writer)
         except Exception as exception:
             error = recorder.failed(exception)
             if not writer.started:
@@ -217,7 +230,6 @@ class EventStreamResponse(Response):
 
     async def _send_events(self, writer: "_BodyWriter") -> None:
         headers = self._request.headers
-        self._tokens.check(headers.get("authorization"))
         check_events_accepted(headers)
         # HEAD asks for the headers only.
         deadline = asyncio.timeout(0.0 if self._request.method == "HEAD" else timeout(headers))

@@ -24,6 +24,7 @@ from service.errors import (
     BadFields,
     DeadlineExceeded,
     Internal,
+    LimitExceeded,
     MethodNotAllowed,
     NotAcceptable,
     NotFound,
@@ -54,7 +55,9 @@ Errors are `application/problem+json` (RFC 9457), with a machine-readable `reaso
 
 _Errors = tuple[type[ServiceError], ...]
 
-_ALL_METHODS: _Errors = (Unauthenticated, NotAcceptable, Overloaded, Unavailable, Internal)
+_ACCESS: _Errors = (Unauthenticated, PermissionDenied, LimitExceeded)
+"""Errors of callers without a key, without the scope, and beyond the limits of their key."""
+_ALL_METHODS: _Errors = (*_ACCESS, NotAcceptable, Overloaded, Unavailable, Internal)
 """Errors that every method can return."""
 _ERRORS: dict[Route[Any, Any], _Errors] = {
     PREDICT: (BadFields, UnknownModel, TooLarge, UnsupportedMediaType, RequestTimeout, DeadlineExceeded),
@@ -75,7 +78,7 @@ _ERRORS: dict[Route[Any, Any], _Errors] = {
     ),
 }
 """Further errors of each method."""
-_RETRYABLE = (Overloaded, Unavailable, TrackingUnavailable)
+_RETRYABLE = (LimitExceeded, Overloaded, Unavailable, TrackingUnavailable)
 _BINARY = {"schema": {"type": "string", "format": "binary"}}
 
 _NOW = 1_700_000_000.0
@@ -84,19 +87,26 @@ EXAMPLE_IDS = {"scene_id": "street-1", "agent_id": "car-1"}
 """The scene that one of the examples names, and an agent of it."""
 
 
-def openapi_document(settings: Settings) -> dict[str, Any]:
-    """Return the document as a server with these settings serves it."""
+def openapi_document(settings: Settings, *, closed: bool = False) -> dict[str, Any]:
+    """Return the document as a server with these settings serves it.
+
+    Args:
+        settings: the limits of requests.
+        closed: True if callers need a key.
+    """
     paths: dict[str, Schema] = {
         route.path: {route.verb.lower(): _operation(route, settings)} for route in ROUTES
     }
-    if settings.api_tokens:
+    paths |= {
+        "/metrics": {"get": _probe("metrics", "Metrics in the Prometheus text format.", *_ACCESS)},
+    }
+    if closed:
         for operations in paths.values():
             for operation in operations.values():
                 operation["security"] = [{"bearer": []}]
     paths |= {
         "/livez": {"get": _probe("livez", "Liveness: whether the process responds.")},
         "/readyz": {"get": _probe("readyz", "Readiness: whether the server accepts calls.", Unavailable)},
-        "/metrics": {"get": _probe("metrics", "Metrics in the Prometheus text format.")},
     }
     document: dict[str, Any] = {
         "openapi": "3.1.0",
@@ -109,7 +119,7 @@ def openapi_document(settings: Settings) -> dict[str, Any]:
         "paths": paths,
         "components": {"schemas": message_schemas(settings) | {"Problem": _problem_schema()}},
     }
-    if settings.api_tokens:
+    if closed:
         document["components"]["securitySchemes"] = {"bearer": {"type": "http", "scheme": "bearer"}}
     return document
 

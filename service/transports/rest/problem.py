@@ -35,7 +35,7 @@ def problem_response(error: ServiceError, headers: dict[str, str] | None = None)
     if error.retry_after is not None:
         headers["Retry-After"] = str(max(1, math.ceil(error.retry_after)))  # whole seconds, by RFC 9110
     if isinstance(error, Unauthenticated):
-        headers["WWW-Authenticate"] = "Bearer"
+        headers.setdefault("WWW-Authenticate", "Bearer")
     return Response(
         orjson.dumps(to_problem(error)), status_code=error.http_status, media_type=MEDIA_TYPE, headers=headers
     )

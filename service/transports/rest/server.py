@@ -12,10 +12,16 @@ import prometheus_client
 import uvicorn
 from fastapi import FastAPI
 from fastapi_offline import FastAPIOffline
+from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
+from starlette.middleware.cors import CORSMiddleware
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
+from starlette.types import ASGIApp
 
+from service.access.gate import Gate
+from service.access.tls import Certificates
+from service.access.watched import Watched
 from service.errors import BadField, MethodNotAllowed, NotFound, ServiceError, Unavailable
 from service.predict.dataplane import DataPlane
 from service.settings import Settings, split_address
@@ -24,6 +30,9 @@ from service.transports.calls import to_service_error
 from service.transports.intake import Intake
 from service.transports.rest.connections import BoundedProtocol, Connections
 from service.transports.rest.endpoints import Endpoints, ExitStackMiddleware
+from service.transports.rest.gate import LIVE_PATH, METRICS_PATH, READY_PATH, GateMiddleware
+from service.transports.rest.handshake import Handshake
+from service.transports.rest.negotiation import TIMEOUT_HEADER
 from service.transports.rest.openapi import openapi_document
 from service.transports.rest.problem import problem_response
 
@@ -34,16 +43,19 @@ _MIN_GRACE = 0.1
 _BACKLOG = 2048
 
 
-def build_app(dataplane: DataPlane, metrics: Metrics, settings: Settings, intake: Intake) -> FastAPI:
+def build_app(
+    dataplane: DataPlane, metrics: Metrics, settings: Settings, intake: Intake, gate: Gate
+) -> FastAPI:
     """Build the application: the contract's routes, probes, metrics and documentation.
 
     Args:
         dataplane: executes the calls.
         metrics: counts the calls, and is served at ``/metrics``.
-        settings: limits and tokens.
+        settings: limits.
         intake: bounds the calls and their bodies.
+        gate: authenticates the callers.
     """
-    document = openapi_document(settings)
+    document = openapi_document(settings, closed=gate.closed)
     # Serve Swagger UI from local files: vehicle networks often cannot reach a CDN.
     app = FastAPIOffline(
         title=document["info"]["title"],
@@ -54,9 +66,38 @@ def build_app(dataplane: DataPlane, metrics: Metrics, settings: Settings, intake
     )
     app.openapi = lambda: document  # type: ignore[method-assign]  # as the FastAPI documentation does
     app.add_middleware(ExitStackMiddleware)
-    for route, endpoint in Endpoints(dataplane, metrics, settings, intake).by_route().items():
+    app.add_middleware(GateMiddleware, gate=gate)
+    if settings.cors_origins:
+        app.add_middleware(
+            CORSMiddleware,
+            allow_origins=settings.cors_origins,
+            allow_methods=["GET", "POST"],
+            allow_headers=["Authorization", TIMEOUT_HEADER],
+            expose_headers=["Retry-After"],
+        )
+    for route, endpoint in Endpoints(dataplane, metrics, settings, intake, gate).by_route().items():
         app.add_route(route.path, endpoint, methods=[route.verb])
 
+    async def show_metrics(_: Request) -> Response:
+        return Response(metrics.render(), media_type=prometheus_client.CONTENT_TYPE_LATEST)
+
+    app.add_route(METRICS_PATH, show_metrics, methods=["GET"])
+    _add_probes(app, dataplane)
+    return app
+
+
+def build_probes(dataplane: DataPlane) -> Starlette:
+    """Build the application of the port for probes alone.
+
+    Args:
+        dataplane: knows whether it is ready.
+    """
+    app = Starlette(exception_handlers={HTTPException: _on_http_error})
+    _add_probes(app, dataplane)
+    return app
+
+
+def _add_probes(app: Starlette, dataplane: DataPlane) -> None:
     async def livez(_: Request) -> Response:
         return PlainTextResponse("alive\n")
 
@@ -67,24 +108,36 @@ def build_app(dataplane: DataPlane, metrics: Metrics, settings: Settings, intake
             return problem_response(error)
         return PlainTextResponse("ready\n")
 
-    async def show_metrics(_: Request) -> Response:
-        return Response(metrics.render(), media_type=prometheus_client.CONTENT_TYPE_LATEST)
-
-    app.add_route("/livez", livez, methods=["GET"])
-    app.add_route("/readyz", readyz, methods=["GET"])
-    app.add_route("/metrics", show_metrics, methods=["GET"])
-    return app
+    app.add_route(LIVE_PATH, livez, methods=["GET"])
+    app.add_route(READY_PATH, readyz, methods=["GET"])
 
 
 class HttpServer:
     """uvicorn on a socket that this class opens; stopped by ``stop``, not by signals."""
 
-    def __init__(self, app: FastAPI, settings: Settings) -> None:
-        self._configured_address = settings.http
-        limits = Connections(
+    def __init__(
+        self,
+        app: ASGIApp,
+        address: str,
+        settings: Settings,
+        certificates: Watched[Certificates] | None = None,
+    ) -> None:
+        """
+        Args:
+            app: the application.
+            address: HOST:PORT to listen on; port 0: any free port.
+            settings: limits of the connections.
+            certificates: certificates for TLS; None: plain HTTP.
+        """
+        self._configured_address = address
+        self._limits = Connections(
             _max_connections(settings), settings.header_timeout, settings.body_timeout, settings.write_timeout
         )
-        protocol: Any = functools.partial(BoundedProtocol, limits)
+        protocol: Any = (
+            functools.partial(BoundedProtocol, self._limits)
+            if certificates is None
+            else functools.partial(Handshake, self._limits, certificates)
+        )
         self._server = _Uvicorn(
             uvicorn.Config(
                 app,
@@ -122,6 +175,8 @@ class HttpServer:
         """
         if self._task is None:
             return
+        for handshake in list(self._limits.handshakes):
+            handshake.transport.abort()
         self._server.config.timeout_graceful_shutdown = max(grace, _MIN_GRACE)  # type: ignore[assignment]  # fractions work
         self._server.should_exit = True
         await self._task

@@ -49,7 +49,9 @@ def test_routes_differ_in_their_addresses() -> None:
 async def test_server_and_document_have_the_routes() -> None:
     server = Server(settings())
     try:
-        endpoints = Endpoints(server.dataplane, server.metrics, server.settings, server.intake).by_route()
+        endpoints = Endpoints(
+            server.dataplane, server.metrics, server.settings, server.intake, server.access.gate
+        ).by_route()
     finally:
         await server.stop(drain=False)
     assert set(endpoints) == set(ROUTES)

@@ -5,7 +5,6 @@ from typing import Any
 import httpx
 import pytest
 from google.protobuf import json_format
-from pydantic import SecretStr
 
 from cab.forecast.v1 import admin_service_pb2 as admin_pb
 from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
@@ -109,7 +108,7 @@ def test_counts_are_strings_as_protobuf_writes_them() -> None:
 
 def test_events_are_documented() -> None:
     watch = DOCUMENT["paths"]["/v1/consistency/events"]["get"]
-    assert sorted(watch["responses"]) == ["200", "401", "406", "422", "429", "500", "503"]
+    assert sorted(watch["responses"]) == ["200", "401", "403", "406", "422", "429", "500", "503"]
     (content,) = watch["responses"]["200"]["content"].items()
     assert content[0] == "text/event-stream"
     event = content[1]["example"]
@@ -136,6 +135,7 @@ def test_errors_are_documented() -> None:
     assert sorted(responses) == [
         "200",
         "401",
+        "403",
         "404",
         "406",
         "408",
@@ -153,7 +153,7 @@ def test_errors_are_documented() -> None:
 
 def test_security_is_documented_when_there_is_some() -> None:
     assert "securitySchemes" not in DOCUMENT["components"]
-    secured = openapi_document(Settings(api_tokens=(SecretStr("x"),)))
+    secured = openapi_document(Settings(), closed=True)
     assert secured["paths"]["/v1/predict"]["post"]["security"] == [{"bearer": []}]
     assert "security" not in secured["paths"]["/livez"]["get"]
 
