@@ -112,7 +112,7 @@ async def test_no_answer_is_lost_or_mixed_while_models_come_and_go() -> None:
             for call in TRANSPORTS.values()
             for agents in (1, 3)
         ]
-        for number in range(2, 8):
+        for number in range(2, 6):
             version = f"{number}.0.0"
             modes[version] = 3 + number
             # Two versions at a time, the older of which leaves with the next reload
@@ -122,9 +122,9 @@ async def test_no_answer_is_lost_or_mixed_while_models_come_and_go() -> None:
             ]
             before = len(answered)
             await reload(server)
-            await until(lambda before=before: len(answered) > before + 8)  # type: ignore[misc]
-        pinned = [await call_grpc(server, make_request(1, model=f"fake@{number}.0.0")) for number in (6, 7)]
-        assert [len(response.forecasts[0].weights) for response in pinned] == [9, 10]
+            await until(lambda before=before: len(answered) > before + 4)  # type: ignore[misc]
+        pinned = [await call_grpc(server, make_request(1, model=f"fake@{number}.0.0")) for number in (4, 5)]
+        assert [len(response.forecasts[0].weights) for response in pinned] == [7, 8]
         over.set()
         await asyncio.gather(*callers)  # a call that failed would raise here
     assert {version for version, _, _ in answered} == set(modes)
