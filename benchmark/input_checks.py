@@ -12,6 +12,7 @@ sign of a velocity of 0.1 m/s does not matter.
 import argparse
 import json
 import sys
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -329,9 +330,9 @@ def _found(tick: Tick) -> list[set[Contradiction]]:
 
 def measure(records: Iterable[SceneRecord]) -> dict[int, Rates]:
     """Return the counts of some scenes by rate, Hz."""
-    random = np.random.default_rng(0)
     rates = {rate_hz: Rates() for rate_hz in RATES_HZ}
     for record in records:
+        random = np.random.default_rng(zlib.crc32(record.name.encode()))
         for rate_hz, counts in rates.items():
             for tick in ticks(record, rate_hz):
                 counts.add(tick, random)

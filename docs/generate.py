@@ -21,6 +21,8 @@ BENCHMARK = DOCS / "data/benchmark_train_val.json"
 """Benchmark figures of the bundled checkpoints on nuScenes train_val."""
 PEERS = DOCS / "data/peers.json"
 """Comparison with other servers, as ``make peers`` writes it."""
+INPUT_CHECKS = DOCS / "data/input_checks.json"
+"""Counts of ``benchmark.input_checks`` on nuScenes train_val and v1.0-mini."""
 
 Row = dict[str, Any]
 
@@ -147,6 +149,56 @@ def merged_table() -> str:
     )
 
 
+def clean_warnings_table() -> str:
+    """Return how often each check of the input is wrong: agents with a warning, in percent."""
+    figures = input_checks()
+    kinds = next(iter(figures.values()))["clean"]
+    return table(
+        ["Code", *figures],
+        [["agents", *(f"{counts['agents']:,}" for counts in figures.values())]]
+        + [
+            [
+                f"`{kind.upper()}`",
+                *(
+                    _slashed(
+                        [counts[part][kind] / counts["agents"] for part in ("clean", "clean, with noise")],
+                        "{:.3%}".format,
+                    )
+                    for counts in figures.values()
+                ),
+            ]
+            for kind in kinds
+        ],
+    )
+
+
+def faults_table() -> str:
+    """Return how often each fault of the input is said; in brackets the agents that it changes much."""
+    figures = input_checks()
+    faults = next(iter(figures.values()))["faults"]
+    return table(
+        ["Fault", *figures],
+        [
+            [
+                fault,
+                *(
+                    "{:.1%} ({:,})".format(
+                        counts["faults"][fault][0] / counts["faults"][fault][1], counts["faults"][fault][1]
+                    )
+                    for counts in figures.values()
+                ),
+            ]
+            for fault in faults
+        ],
+    )
+
+
+def input_checks() -> dict[str, Any]:
+    """Return the counts of ``benchmark.input_checks`` by data set and rate."""
+    found: dict[str, Any] = json.loads(INPUT_CHECKS.read_text(encoding="utf-8"))
+    return {f"{data}, {rate}": counts for data, rates in found.items() for rate, counts in rates.items()}
+
+
 def consistency_table() -> str:
     """Return the table of dispersion, convergence-to-range and the hardest pairs."""
     return table(
@@ -172,6 +224,7 @@ def benchmark(key: str) -> list[Row]:
 PAGES: dict[str, dict[str, Callable[[], str]]] = {
     "performance.md": {"peers": lambda: Comparisons.read(PEERS).markdown()},
     "settings.md": {"settings": settings_table},
+    "warnings.md": {"clean": clean_warnings_table, "faults": faults_table},
     "models.md": {
         "displacement_causal": lambda: displacement_table("displacement_causal"),
         "merged_causal": merged_table,

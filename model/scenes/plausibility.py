@@ -127,6 +127,19 @@ def find_contradictions(
     ]
 
 
+def find_breaks(observations: Observations) -> list[Finding]:
+    """Return only where positions or headings break off, as if the agent were another: see above.
+
+    Args:
+        observations: observations of N agents, all of them up to the present.
+    """
+    recent = _Recent.of(observations)
+    jumps = _jumps(recent)
+    usable = np.ones(len(recent.time), dtype=np.bool_)
+    usable[[finding.row for finding in jumps]] = False
+    return [*jumps, *_flips(recent, usable)]
+
+
 @dataclass(frozen=True)
 class _Recent:
     """The newest observations of N agents, K each, padded at the front: the last column is the newest."""
@@ -145,8 +158,11 @@ class _Recent:
         columns = min(int(count.max()), _NEWEST)
         state = count[:, None] - np.arange(columns, 0, -1)
         rows, padding = np.arange(len(count))[:, None], state < 0
+        same = bool((count == count[0]).all())  # nearly always: then there is no padding
 
         def newest(values: Floats) -> Floats:
+            if same:
+                return values[:, count[0] - columns : count[0]]
             taken: Floats = values[rows, np.maximum(state, 0)]
             taken[padding] = np.nan
             return taken
@@ -247,17 +263,19 @@ def _flips(recent: _Recent, usable: Bools) -> list[Finding]:
 
 def _velocities(recent: _Recent, motion: _Motion, usable: Bools) -> list[Finding]:
     """Find velocities that lead elsewhere than the positions."""
-    given = np.isfinite(recent.velocity[..., 0])
+    first = int(motion.start.min())
+    velocity, within = recent.velocity[:, first:], motion.within[:, first:]
+    given = np.isfinite(velocity[..., 0])
     if not given.any():
         return []
     # Over each interval the mean of both ends, or the one that is given
-    both = (given[:, 1:] + given[:, :-1])[..., None]
-    sums = np.where(given[..., None], recent.velocity, 0.0)
-    mean = (sums[:, 1:] + sums[:, :-1]) / np.maximum(given[:, 1:] * 1 + given[:, :-1], 1)[..., None]
-    counted = both[..., 0] & motion.within[:, :-1] & motion.within[:, 1:]
-    gap = np.where(counted, recent.gap, 0.0)
-    told = (np.where(counted[..., None], mean, 0.0) * gap[..., None]).sum(axis=1)
-    way = np.where(counted[..., None], np.diff(recent.position, axis=1), 0.0).sum(axis=1)
+    ends = given[:, 1:] + given[:, :-1].astype(np.int64)
+    sums = np.where(given[..., None], velocity, 0.0)
+    counted = (ends > 0) & within[:, :-1] & within[:, 1:]
+    gap = np.where(counted, recent.gap[:, first:], 0.0)
+    told = ((sums[:, 1:] + sums[:, :-1]) * (gap / np.maximum(ends, 1))[..., None]).sum(axis=1)
+    position = recent.position[:, first:]
+    way = np.where(counted[..., None], position[:, 1:] - position[:, :-1], 0.0).sum(axis=1)
     seconds = gap.sum(axis=1)
     length, way_length = np.hypot(*told.T), np.hypot(*way.T)
     off = np.hypot(*(told - way).T)
@@ -291,27 +309,30 @@ def _velocity_hint(told: Floats, way: Floats, heading: float) -> str:
 
 def _headings(recent: _Recent, motion: _Motion, types: Sequence[AgentType], usable: Bools) -> list[Finding]:
     """Find headings off the direction of motion, in degrees, or mirrored."""
-    headings = np.where(motion.within, recent.heading, np.nan)
-    given = np.isfinite(headings)
-    if not given.any():
-        return []
-    mean, degrees = _mean_angle(headings, given), _mean_angle(np.deg2rad(headings), given)
-    course, speed = motion.course.copy(), motion.distance / np.where(motion.seconds > 0, motion.seconds, 1.0)
-    # Where positions tell no motion, the velocity does
-    still = motion.seconds == 0
-    velocity = recent.velocity[:, -1]
-    speed = np.where(still, np.hypot(velocity[:, 0], velocity[:, 1]), speed)
-    fast = still & (speed >= HEADING_DISTANCE / SPAN)
-    course = np.where(fast, np.arctan2(velocity[:, 1], velocity[:, 0]), course)
-
+    first = int(motion.start.min())
+    headings = recent.heading[:, first:]
+    given = motion.within[:, first:] & np.isfinite(headings)
     some = given.any(axis=1) & usable
+    if not some.any():
+        return []
+    mean = _mean_angle(headings, given)
+    course, speed = motion.course, motion.distance / np.where(motion.seconds > 0, motion.seconds, 1.0)
+    still = motion.seconds == 0
+    if still.any():  # where positions tell no motion, the velocity does
+        velocity = recent.velocity[:, -1]
+        speed = np.where(still, np.hypot(velocity[:, 0], velocity[:, 1]), speed)
+        fast = still & (speed >= HEADING_DISTANCE / SPAN)
+        course = np.where(fast, np.arctan2(velocity[:, 1], velocity[:, 0]), course)
+
     off = np.abs(wrap_angle(course - mean))  # NaN where either is unknown
     walks = np.array([kind in (AgentType.PEDESTRIAN, AgentType.UNKNOWN) for kind in types], dtype=np.bool_)
     reverses = (off > REVERSE_OFF) & (speed < REVERSE_SPEED)
     bad = some & (off > HEADING_OFF) & ~reverses & ~walks
-    as_degrees = np.abs(wrap_angle(course - degrees)) <= FIT
+    large = some & (np.where(given, np.abs(headings), 0.0).max(axis=1) > MANY_TURNS)
+    if not (bad.any() or large.any()):
+        return []
     fits = some & (off <= FIT) & ~walks
-    large = some & (np.nanmax(np.where(given, np.abs(headings), 0.0), axis=1) > MANY_TURNS)
+    as_degrees = np.abs(wrap_angle(course - _mean_angle(np.deg2rad(headings), given))) <= FIT
     in_degrees = bad & as_degrees & large
     witnesses, against = int((bad & as_degrees).sum()), int((fits & ~as_degrees).sum())
     if large.any() and (witnesses or 2 * large.sum() > some.sum()) and witnesses >= 2 * against:
@@ -352,14 +373,14 @@ def _off_map(
         return []
     path = _path(recent, motion, moving)
     found = []
-    own = np.isin(moving, list(patches))
-    on_raster = np.setdiff1d(np.arange(len(vehicle)), list(patches))
+    own = np.array([row in patches for row in moving.tolist()], dtype=np.bool_)
     if raster is not None and not own.all():
         points = path[~own]
         share = _share_off(raster.layers[0], (points - raster.origin) * raster.pixels_per_meter)
         if share > OFF_SHARE:
-            detail = _off_detail(share, int((~own).sum())) + _map_hint(raster, points)
-            found += [_finding(recent, row, -1, Contradiction.OFF_MAP, "", detail) for row in on_raster]
+            detail = _off_detail(share, len(points)) + _map_hint(raster, points)
+            without = [row for row in range(len(types)) if row not in patches]
+            found += [_finding(recent, row, -1, Contradiction.OFF_MAP, "", detail) for row in without]
     if own.any():
         heading = recent.heading[moving[own], -1]
         heading = np.where(np.isfinite(heading), heading, motion.course[moving[own]])
@@ -381,16 +402,16 @@ def _off_map(
 def _path(recent: _Recent, motion: _Motion, rows: Ints) -> Floats:
     """Return n agents' positions at ``PATH_AGES`` and ``PATH_AHEAD``: [n, P, 2], m; NaN where unknown."""
     time, position = recent.time[rows], recent.position[rows]
-    ages = time[:, -1:] - time
-    points = []
-    for age in PATH_AGES:
-        column = (recent.connected[rows] & (ages <= age + _ROUNDING)).argmax(axis=1)
-        index = np.arange(len(rows))
-        near = age - ages[index, column] <= PATH_AGES[1] / 2
-        points.append(np.where(near[:, None], position[index, column], np.nan))
+    ages = np.where(recent.connected[rows], time[:, -1:] - time, np.inf)
+    wanted = np.array(PATH_AGES)
+    # The first observation of that age or less, if it is near that age
+    column = (ages[:, None, :] <= wanted[:, None] + _ROUNDING).argmax(axis=2)
+    index = np.arange(len(rows))[:, None]
+    near = wanted - ages[index, column] <= PATH_AGES[1] / 2
+    behind = np.where(near[..., None], position[index, column], np.nan)
     velocity = motion.way[rows] / motion.seconds[rows, None]
-    points += [position[:, -1] + velocity * seconds for seconds in PATH_AHEAD]
-    return np.stack(points, axis=1)
+    ahead = position[:, -1:] + velocity[:, None] * np.array(PATH_AHEAD)[:, None]
+    return np.concatenate([behind, ahead], axis=1)
 
 
 def _share_off(driveable: Bytes | Float32s, pixels: Floats) -> float:
@@ -400,11 +421,13 @@ def _share_off(driveable: Bytes | Float32s, pixels: Floats) -> float:
         driveable: [rows, columns], 0 or 1.
         pixels: [..., 2], row and column of the points; NaN: unknown, and not counted.
     """
-    known = np.isfinite(pixels).all(axis=-1)
-    index = np.rint(pixels[known]).astype(np.int64)
-    inside = ((index >= 0) & (index < np.array(driveable.shape))).all(axis=1)
-    on = driveable[tuple(index[inside].T)] >= 0.5
-    return 1.0 - float(on.sum()) / max(len(index), 1)
+    row, column = pixels[..., 0], pixels[..., 1]
+    rows, columns = driveable.shape
+    inside = (row > -0.5) & (row < rows - 0.5) & (column > -0.5) & (column < columns - 0.5)
+    index = np.rint(pixels[inside]).astype(np.int64)
+    on = driveable[index[:, 0], index[:, 1]] >= 0.5
+    known = row.size - int(np.isnan(row).sum())
+    return 1.0 - float(on.sum()) / max(known, 1)
 
 
 def _off_detail(share: float, vehicles: int) -> str:

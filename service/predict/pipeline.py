@@ -21,7 +21,7 @@ from service.predict.admission import Admission, Call
 from service.predict.batcher import Batcher
 from service.predict.catalog import Catalog
 from service.predict.encode import count_off_road, encode
-from service.predict.input_warnings import code_name, code_names
+from service.predict.input_warnings import HISTORY_S, add_warnings, code_name, code_names, memory_warnings
 from service.predict.plan import Plan, frames_of, make_plan, set_outcomes
 from service.predict.request import Agents, Options, read_agents, read_options
 from service.predict.request_reader import EncodedRequest, RequestReader
@@ -155,6 +155,9 @@ class Pipeline:
                 else:
                     response, stored = await asyncio.gather(encoding, self._remember(plan, recalled, call))
                     report(response, recalled, stored)
+                    known = {} if options.recalls else stored.histories
+                    told = memory_warnings(plan.agents, recalled or stored, known)
+                    add_warnings(response, [draft.index for draft in plan.drafts], told)
         self._count_agents(plan)
         self._count_warnings(response)
         if self.shadow is not None:
@@ -209,7 +212,10 @@ class Pipeline:
         stored = forecast_updates(plan, recalled is not None and recalled.answered)
         latest = options.consistency and not options.recalls
         patience = call.remaining() - _RESERVE
-        return await self._tracker.exchange(options.scene_id, options.time, stored, patience, latest=latest)
+        history_s = None if options.recalls else HISTORY_S
+        return await self._tracker.exchange(
+            options.scene_id, options.time, stored, patience, history_s=history_s, latest=latest
+        )
 
     def _count_agents(self, plan: Plan) -> None:
         name = plan.forecaster.info.name

@@ -38,6 +38,8 @@ TYPES = {
     models_pb.AGENT_TYPE_CYCLIST: AgentType.CYCLIST,
     models_pb.AGENT_TYPE_UNKNOWN: AgentType.UNKNOWN,
 }
+UNKNOWN_TYPE_NAME = -1
+"""Agent type that stands for a name that the contract does not have."""
 _CONTEXTS = {
     pb.CONTEXT_UNSPECIFIED: Context.FULL,
     pb.CONTEXT_FULL: Context.FULL,
@@ -59,6 +61,7 @@ _FIXED64 = 1  # wire type
 _IS_TAG = np.zeros(256, dtype=np.bool_)
 _IS_TAG[[field.number << 3 | _FIXED64 for field in pb.AgentState.DESCRIPTOR.fields]] = True
 _DOUBLE_BYTES = 9  # tag and value
+_YEAR_2000, _YEAR_2100 = 9.46e8, 4.1e9  # s since the epoch
 if len(_FIELDS) != _RATE + 1 or any(
     field.type != FieldDescriptor.TYPE_DOUBLE or field.number != index + 1
     for index, field in enumerate(pb.AgentState.DESCRIPTOR.fields)
@@ -282,7 +285,16 @@ def _check_number(field: str, value: float, low: float, high: float) -> None:
     if not math.isfinite(value):
         raise BadField(field, "must be a finite number")
     if not low <= value <= high:
-        raise BadField(field, f"must be within {low:g} … {high:g}")
+        hint = _unit_hint(value) if field == "time" else ""
+        raise BadField(field, f"must be within {low:g} … {high:g}{hint}")
+
+
+def _unit_hint(time: float) -> str:
+    """Return what unit a time too large for seconds has, if it is of this age, as the end of a sentence."""
+    for unit, per_second in (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)):
+        if _YEAR_2000 <= time / per_second <= _YEAR_2100:
+            return f" s; it seems to be in {unit}"
+    return ""
 
 
 def _read_patch(agent: pb.Agent, name: _PatchName, path: str) -> Bytes:
@@ -311,6 +323,9 @@ def _head_faults(request: pb.PredictRequest, ids: Sequence[str], settings: Setti
             faults[index] = Fault(f"{path}.id", id_too_long(agent_id))
         elif agent.type == models_pb.AGENT_TYPE_UNSPECIFIED:
             faults[index] = Fault(f"{path}.type", "type is required")
+        elif agent.type == UNKNOWN_TYPE_NAME:
+            names = ", ".join(map(models_pb.AgentType.Name, TYPES))
+            faults[index] = Fault(f"{path}.type", f"unknown name; it is one of {names}")
         elif agent.type not in TYPES:
             faults[index] = Fault(f"{path}.type", f"unknown value {agent.type}")
         elif not agent.states:
@@ -443,7 +458,8 @@ class _StateTable:
             return "is required"
         if not np.isfinite(self._values[row, column]):
             return "must be a finite number"
-        return f"must be within ±{_BOUNDS[column]:g}"
+        hint = _unit_hint(float(self._values[row, column])) if column == _TIME else ""
+        return f"must be within ±{_BOUNDS[column]:g}{hint}"
 
     def _successive(self) -> Ints:
         """Return the rows that have a predecessor of the same agent."""

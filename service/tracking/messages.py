@@ -16,6 +16,7 @@ AGENT_TRACKING = {
     TrackStatus.KEPT: pb.TRACKING_STATUS_OK,
     TrackStatus.NEW: pb.TRACKING_STATUS_NEW,
     TrackStatus.RESET: pb.TRACKING_STATUS_RESET,
+    TrackStatus.RETYPED: pb.TRACKING_STATUS_OK,
 }
 """Tracking status of an agent in the contract."""
 SCENE_TRACKING = {

@@ -11,7 +11,7 @@ from service.tracking.aggregates import Aggregates
 from service.tracking.messages import AGENT_TRACKING, SCENE_TRACKING, instant_messages
 from service.tracking.metrics import instant_metrics
 from service.tracking.model_references import ModelReferences
-from service.tracking.store.base import ExchangeResult, StoreError, TrackStore, TrackUpdate
+from service.tracking.store.base import ExchangeResult, StoreError, TrackStatus, TrackStore, TrackUpdate
 from service.tracking.store.guard import Guard
 
 STORE_TIMEOUT = 2.0
@@ -27,6 +27,10 @@ class TrackingResult:
     status: "pb.TrackingStatus.ValueType" = pb.TRACKING_STATUS_UNAVAILABLE
     agents: "dict[str, pb.TrackingStatus.ValueType]" = field(default_factory=dict)
     """Status by agent id; empty if the memory was unavailable."""
+    retyped: frozenset[str] = frozenset()
+    """Ids of agents whose tracks were of another type."""
+    behind_s: float = 0.0
+    """Seconds that the call is before the scene's newest one; 0 for a repeated call."""
     histories: dict[str, bytes] = field(default_factory=dict)
     """History by agent id, if requested."""
     latest: dict[str, pb.InstantConsistency] = field(default_factory=dict)
@@ -118,6 +122,12 @@ class Tracker:
             agent_id: AGENT_TRACKING[status]
             for agent_id, status in zip(ids, result.track_statuses, strict=True)
         }
+        tracking.retyped = frozenset(
+            agent_id
+            for agent_id, status in zip(ids, result.track_statuses, strict=True)
+            if status is TrackStatus.RETYPED
+        )
+        tracking.behind_s = result.behind_s
         tracking.histories = dict(zip(ids, result.histories, strict=False))
         if latest:
             messages = self._aggregate(scene_id, result, latest)

@@ -35,6 +35,8 @@ class TrackStatus(IntEnum):
     """The agent had no track."""
     RESET = 2
     """The track contradicted the call and was replaced by a new one."""
+    RETYPED = 3
+    """The track was kept, but the call gives the agent another type."""
 
 
 class TrackUpdate(NamedTuple):
@@ -88,6 +90,8 @@ class ExchangeResult:
     """Newest observation of each agent with a model, and all instants that the call settled."""
     watched: bool
     """True if the scene has a watcher, on any server."""
+    behind_s: float = 0.0
+    """Seconds that the call is before the scene's newest one; 0 for a repeated call."""
 
 
 @dataclass(frozen=True)

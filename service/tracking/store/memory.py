@@ -46,6 +46,7 @@ class MemoryStore(TrackStore):
             result.histories,
             join_instants(result.instants),
             self._fanout.watched(scene_id),
+            result.behind_s,
         )
 
     async def read(self, scene_id: str, window: float, agent_id: str | None = None) -> SceneSnapshot:

@@ -5,6 +5,7 @@ log orders the calls of all servers, are therefore equal.
 """
 
 import asyncio
+from bisect import bisect_left, insort
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -16,6 +17,8 @@ from service.tracking.store.track import Instant, Track
 
 MAX_AGENTS = 4096
 """Agents per scene."""
+MAX_CALLS = 512
+"""Calls per scene whose times are kept."""
 
 
 @dataclass
@@ -28,6 +31,8 @@ class ApplyResult:
     """History of each agent of the call, if requested."""
     instants: list[Instant] = field(default_factory=list)
     """Instants to report."""
+    behind_s: float = 0.0
+    """Seconds that this call is before the scene's newest one; 0 for a repeated call."""
     restarted: bool = False
     """True if the scene was cleared because its newest call was too far ahead of this one."""
 
@@ -37,6 +42,8 @@ class SceneMemory:
 
     def __init__(self) -> None:
         self._newest = float("-inf")
+        self._calls: list[float] = []
+        """Times of the calls within the window, s, ascending."""
         self._tracks: dict[str, Track] = {}
 
     def __len__(self) -> int:
@@ -56,11 +63,14 @@ class SceneMemory:
             history_s: seconds of history to return; None: no histories.
         """
         result = ApplyResult()
+        behind_s = self._newest - entry.time
+        repeated = self._note_call(entry.time)
         cleared: Sequence[str] = ()
         if entry.time < self._newest - LATENESS - TIME_TOLERANCE:
             result.restarted = True
             cleared = tuple(self._tracks)
             self._tracks.clear()
+            self._calls = [entry.time]
             self._newest = entry.time
         self._newest = max(self._newest, entry.time)
         self._drop_tracks_before(self.cut)
@@ -70,15 +80,22 @@ class SceneMemory:
             status = TrackStatus.NEW if track is None else TrackStatus.KEPT
             if update.agent_id in cleared:
                 status = TrackStatus.RESET
-            if track is not None and not track.fits(update.agent_type, observations):
+            if track is not None and not track.fits(observations):
                 track, status = None, TrackStatus.RESET
             if track is None:
                 track = self._tracks[update.agent_id] = Track(update.agent_type)
                 self._make_room()
+            if track.agent_type != update.agent_type:
+                status = TrackStatus.RETYPED
+                if entry.time == self._newest:
+                    track.agent_type = update.agent_type
             result.track_statuses.append(status)
             result.instants.extend(track.apply(update, observations, entry.time, self.cut))
             if history_s is not None:
                 result.histories.append(track.history(entry.time, history_s))
+        # A repeated call says the same; one that contradicts is another call, by a clock that was set back
+        if behind_s > TIME_TOLERANCE and (not repeated or TrackStatus.RESET in result.track_statuses):
+            result.behind_s = behind_s
         return result
 
     async def snapshot(self, window: float, agent_id: str | None = None) -> tuple[list[str], list[Instant]]:
@@ -99,6 +116,16 @@ class SceneMemory:
                 instants.extend(track.snapshot(one, window))
                 await asyncio.sleep(0)
         return ids, instants
+
+    def _note_call(self, time: float) -> bool:
+        """Store the time of a call, and return whether there was one of that time."""
+        calls = self._calls
+        del calls[: max(bisect_left(calls, self.cut), len(calls) - MAX_CALLS)]
+        at = bisect_left(calls, time - TIME_TOLERANCE)
+        if at < len(calls) and calls[at] <= time + TIME_TOLERANCE:
+            return True
+        insort(calls, time)
+        return False
 
     def _drop_tracks_before(self, cut: float) -> None:
         dropped = [agent_id for agent_id, track in self._tracks.items() if track.newest < cut]

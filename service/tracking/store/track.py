@@ -41,7 +41,8 @@ class Track:
     """
 
     def __init__(self, agent_type: bytes) -> None:
-        self._agent_type = agent_type
+        self.agent_type = agent_type
+        """Type in the newest call, one of ``records.AGENT_TYPES``."""
         self._observations = ObservationBuffer()
         self._forecasts: dict[str, ForecastHistory] = {}
         """Forecasts by model."""
@@ -55,14 +56,15 @@ class Track:
                 newest = max(newest, forecasts.times[-1])
         return newest
 
-    def fits(self, agent_type: bytes, observations: ObservationBuffer) -> bool:
+    def fits(self, observations: ObservationBuffer) -> bool:
         """Return whether the observations of a call can be of this agent.
 
+        Detectors waver between types, so the type does not count.
+
         Args:
-            agent_type: one of ``records.AGENT_TYPES``.
             observations: observations of the call.
         """
-        return agent_type == self._agent_type and self._observations.agrees(observations)
+        return self._observations.agrees(observations)
 
     def apply(
         self, update: TrackUpdate, observations: ObservationBuffer, time: float, cut: float

@@ -12,6 +12,7 @@ key.
 
 import base64
 import functools
+import json
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -24,7 +25,9 @@ from google.protobuf.message import Message
 from starlette.datastructures import QueryParams
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
+from cab.forecast.v1.model_service_pb2 import AgentType
 from service.errors import BadField, TooLarge
+from service.predict.request import UNKNOWN_TYPE_NAME
 from service.predict.request_reader import RequestLimits
 
 _M = TypeVar("_M", bound=Message)
@@ -39,6 +42,9 @@ _MAX_TEXT = 4000
 """Characters of a ParseError's text that are searched."""
 
 _AGENTS = pb.PredictRequest.DESCRIPTOR.fields_by_number[pb.PredictRequest.AGENTS_FIELD_NUMBER].name
+_TYPE = pb.Agent.DESCRIPTOR.fields_by_number[pb.Agent.TYPE_FIELD_NUMBER].name
+_TYPE_NAMES = frozenset(AgentType.keys())
+_INTEGER = re.compile(r"[+-]?\d+")
 _STATES = pb.Agent.DESCRIPTOR.fields_by_number[pb.Agent.STATES_FIELD_NUMBER].name
 _STATE_FIELDS = {
     spelling: field.name
@@ -70,6 +76,9 @@ def load_document(body: bytes) -> dict[str, Any]:
     try:
         document = orjson.loads(body)
     except orjson.JSONDecodeError as error:
+        place = _place_of_constant(body)
+        if place:
+            raise BadField(place, "must be a finite number; NaN and Infinity are not JSON") from error
         raise BadField("body", f"is not valid JSON: {error}") from error
     if not isinstance(document, dict):
         raise BadField("body", "must be a JSON object")
@@ -119,6 +128,7 @@ def read_request(body: bytes, limits: RequestLimits) -> pb.PredictRequest:
     _check_body(body, limits)
     document = load_document(body)
     _check_document(document, limits)
+    _mark_unknown_types(document)
     states = _pop_plain_states(document)
     request = from_document(pb.PredictRequest, document)
     for index, plain in states.items():
@@ -200,6 +210,37 @@ def _check_document(document: dict[str, Any], limits: RequestLimits) -> None:
     limits.check_agents(len(agents))
     states = [agent[_STATES] for agent in agents if isinstance(agent, dict) and _STATES in agent]
     limits.check_states(sum(len(each) for each in states if isinstance(each, list)))
+
+
+def _place_of_constant(body: bytes) -> str:
+    """Return the path of the first bare NaN or Infinity in JSON, valid otherwise; empty: there is none."""
+    if b"NaN" not in body and b"Infinity" not in body:
+        return ""
+    constant = object()
+    try:
+        document = json.loads(body, parse_constant=lambda _: constant)
+    except (ValueError, RecursionError):
+        return ""
+    left: list[tuple[str, Any]] = [("", document)]
+    while left:
+        path, value = left.pop()
+        if value is constant:
+            return _snake(path.lstrip("."))[:_MAX_REASON]
+        # Backwards onto the stack, so that the first one is found first
+        if isinstance(value, dict):
+            left += [(f"{path}.{name}", each) for name, each in reversed(value.items())]
+        elif isinstance(value, list):
+            left += [(f"{path}[{at}]", value[at]) for at in range(len(value) - 1, -1, -1)]
+    return ""
+
+
+def _mark_unknown_types(document: dict[str, Any]) -> None:
+    """Replace unknown names of agent types by a number: as over gRPC, they cost no forecast of others."""
+    agents = document.get(_AGENTS)
+    for agent in agents if isinstance(agents, list) else ():
+        name = agent.get(_TYPE) if isinstance(agent, dict) else None
+        if isinstance(name, str) and name not in _TYPE_NAMES and not _INTEGER.fullmatch(name):
+            agent[_TYPE] = UNKNOWN_TYPE_NAME
 
 
 def _pop_plain_states(document: dict[str, Any]) -> dict[int, list[pb.AgentState]]:

@@ -139,7 +139,9 @@ class RedisStore(TrackStore):
             status = SceneStatus.LOST if scene.lost else SceneStatus.NEW if is_new else SceneStatus.KEPT
             instants = join_instants([*scene.unreported, *result.instants])
             scene.lost, scene.unreported = False, []
-        return ExchangeResult(status, result.track_statuses, result.histories, instants, watched)
+        return ExchangeResult(
+            status, result.track_statuses, result.histories, instants, watched, result.behind_s
+        )
 
     async def read(self, scene_id: str, window: float, agent_id: str | None = None) -> SceneSnapshot:
         async with self._locked(scene_id) as scene:

@@ -180,13 +180,41 @@ def test_agents_are_told_apart() -> None:
     assert found["b", MODEL, time]["blocks"]["point"][0, 1].tolist() == [where(time)[0], 52.0]
 
 
-def test_another_type_begins_anew() -> None:
+def test_a_type_that_wavers_keeps_its_track() -> None:
     scene = SceneMemory()
     first = replay(scene, list(times(12)))
     assert [outcome.track_statuses for outcome in first] == [[TrackStatus.NEW]] + [[TrackStatus.KEPT]] * 11
-    (outcome,) = replay(scene, [times(13)[-1]], agent_type=b"p")
+    (outcome,) = replay(scene, [times(13)[-1]], agent_type=b"c")
+    assert outcome.track_statuses == [TrackStatus.RETYPED]
+    assert settled([outcome])
+    late, again, back = (
+        replay(scene, [moment], agent_type=kind)[0].track_statuses[0]
+        for moment, kind in ((times(13)[-1] - 0.25, b"v"), (times(14)[-1], b"c"), (times(15)[-1], b"v"))
+    )
+    assert (late, again, back) == (TrackStatus.RETYPED, TrackStatus.KEPT, TrackStatus.RETYPED)
+
+
+@pytest.mark.parametrize("step", [0.1, 0.5])
+@pytest.mark.parametrize("jump", [0.06, 0.33])
+def test_a_call_that_is_behind_says_by_how_much(step: float, jump: float) -> None:
+    scene = SceneMemory()
+    moments = list(times(10, step))
+    assert [outcome.behind_s for outcome in replay(scene, moments)] == [0.0] * 10
+    assert [outcome.behind_s for outcome in replay(scene, moments[-3:])] == [0.0] * 3  # repeated
+    back = [moments[-1] - jump + step * number for number in range(8)]
+    expected = [max(jump - step * number, 0.0) for number in range(8)]
+    assert [outcome.behind_s for outcome in replay(scene, back)] == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_repeated_time_with_another_content_is_behind() -> None:
+    scene = SceneMemory()
+    moments = list(times(10))
+    replay(scene, moments)
+    (outcome,) = replay(scene, moments[-3:-2], off=5.0)
+    assert outcome.behind_s == pytest.approx(1.0)
+    (outcome,) = replay(scene, moments[-8:-7])
     assert outcome.track_statuses == [TrackStatus.RESET]
-    assert not settled([outcome])
+    assert outcome.behind_s == pytest.approx(3.5)
 
 
 @pytest.mark.parametrize("off", [60.0, 1e6])
