@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 
 from cab.forecast.v1.consistency_service_pb2 import TRACKING_STATUS_RESET, TRACKING_STATUS_UNAVAILABLE
-from cab.forecast.v1.prediction_service_pb2 import FORECAST_STATUS_INVALID, PredictResponse
-from cab_forecast import Status, Tracking, demo_request, forecasts, tracking
+from cab.forecast.v1.prediction_service_pb2 import (
+    FORECAST_STATUS_INVALID,
+    INPUT_WARNING_CODE_TIME_UNIT,
+    PredictResponse,
+)
+from cab_forecast import InputWarning, Status, Tracking, demo_request, forecasts, tracking
 from tests.cab_forecast.answers import MODEL, TURN_RATES, WEIGHTS, answer
 
 
@@ -54,6 +58,16 @@ def test_a_second_report_on_an_id_does_not_hide_the_first(response: PredictRespo
 def test_a_status_of_the_future(response: PredictResponse) -> None:
     response.forecasts[0].status = 99  # type: ignore[assignment]
     assert forecasts(response)["car-straight"].status is Status.UNSPECIFIED
+
+
+def test_warnings_of_the_input(response: PredictResponse) -> None:
+    assert forecasts(response)["car-straight"].warnings == ()
+    entry = response.forecasts[0]
+    entry.warnings.add(code=INPUT_WARNING_CODE_TIME_UNIT, detail="in ns?", field="agents[0].states[1].time")
+    entry.warnings.add(code=99)
+    first, unknown = forecasts(response)["car-straight"].warnings
+    assert first == InputWarning("TIME_UNIT", "in ns?", "agents[0].states[1].time")
+    assert unknown.code == "UNSPECIFIED"
 
 
 def test_tracking_and_consistency(response: PredictResponse) -> None:

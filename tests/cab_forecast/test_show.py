@@ -15,7 +15,12 @@ from cab.forecast.v1.consistency_service_pb2 import (
     TRACKING_STATUS_UNAVAILABLE,
 )
 from cab.forecast.v1.model_service_pb2 import ModelReference
-from cab.forecast.v1.prediction_service_pb2 import FORECAST_STATUS_FALLBACK, PredictRequest, PredictResponse
+from cab.forecast.v1.prediction_service_pb2 import (
+    FORECAST_STATUS_FALLBACK,
+    INPUT_WARNING_CODE_OFF_MAP,
+    PredictRequest,
+    PredictResponse,
+)
 from cab_forecast import demo_request
 from cab_forecast.show import print_forecasts
 from tests.cab_forecast.answers import answer
@@ -129,6 +134,16 @@ def test_what_became_of_the_memory() -> None:
     text = shown(response)
     assert "warning: the server no longer has the tracks of the scene" in text
     assert "start anew: truck-behind" in text
+
+
+def test_warnings_of_the_input_are_shown_once() -> None:
+    response = answer(demo_request())
+    for forecast in response.forecasts[:2]:
+        forecast.warnings.add(
+            code=INPUT_WARNING_CODE_OFF_MAP, detail="90 % of the paths", field="scene_raster"
+        )
+    names = ", ".join(forecast.agent_id for forecast in response.forecasts[:2])
+    assert shown(response).count(f"warning: OFF_MAP: {names}: 90 % of the paths") == 1
 
 
 def test_an_empty_answer() -> None:
