@@ -137,6 +137,18 @@ class UnknownTrack(ServiceError):
     title = "Not remembered"
 
 
+class UnknownRaster(ServiceError):
+    """Error of a call that names a raster by its digest alone, which the server does not have."""
+
+    code = "FAILED_PRECONDITION"
+    http_status = 412
+    reason = "UNKNOWN_RASTER"
+    title = "Unknown raster"
+
+    def __init__(self, digest: bytes) -> None:
+        super().__init__(f"no raster with the digest {digest.hex()} is kept; send it whole")
+
+
 class TooLarge(ServiceError):
     """Error of a request that exceeds a size limit; a retry would fail the same way."""
 
@@ -251,6 +263,7 @@ TABLE: tuple[type[ServiceError], ...] = (
     LimitExceeded,
     UnknownModel,
     UnknownTrack,
+    UnknownRaster,
     TooLarge,
     Overloaded,
     DeadlineExceeded,

@@ -60,6 +60,12 @@ class Settings(BaseSettings):
     max_tracked_agents: int = Field(default=5_000, ge=1)
     """Max number of agents that this process keeps in memory; beyond it the scenes that were called longest
     ago are evicted. With Redis they are read again at their next call."""
+    max_kept_raster_bytes: int = Field(default=256 * 2**20, ge=0)
+    """Max size of the decoded scene rasters, three bytes a pixel, that this process keeps for calls that name
+    them by their digest; beyond it the least recently used are dropped. 0: none is kept."""
+    max_stored_raster_bytes: int = Field(default=64 * 2**20, ge=0)
+    """Max size of the encoded scene rasters that all servers together keep in Redis, beside the tracks.
+    0: none is kept there."""
     models: Path | None = None
     """Folder of checkpoints; None: the bundled ones, if any."""
     default_model: str | None = None

@@ -14,6 +14,8 @@ from service.predict.admission import Admission
 from service.predict.batcher import Batcher
 from service.predict.catalog import Catalog, reference
 from service.predict.pipeline import Pipeline
+from service.predict.rasters.library import RasterLibrary
+from service.predict.rasters.shared import SharedRasters
 from service.predict.reload import Load, Reloader
 from service.predict.shadow import Shadow
 from service.predict.torch_threads import set_helper_threads
@@ -68,8 +70,18 @@ class DataPlane:
             metrics,
         )
         """Calls of the consistency service."""
+        self._rasters = RasterLibrary(
+            settings, metrics, self._threads, SharedRasters.from_settings(settings, store_metrics)
+        )
         self._pipeline = Pipeline(
-            settings, metrics, self._lifecycle, self._admission, self._batcher, tracker, self._threads
+            settings,
+            metrics,
+            self._lifecycle,
+            self._admission,
+            self._batcher,
+            tracker,
+            self._rasters,
+            self._threads,
         )
         if settings.shadow is not None and shadow_tracker is not None:
             name, share = split_shadow(settings.shadow)
@@ -204,6 +216,7 @@ class DataPlane:
             await self._shadow_guard.close()
         await self._asking.close()
         await self._store.close()
+        await self._rasters.close()
         await asyncio.to_thread(self._threads.shutdown, cancel_futures=True)
 
     async def list_models(self, request: pb.ListModelsRequest) -> pb.ListModelsResponse:

@@ -23,6 +23,7 @@ from service.predict.catalog import Catalog
 from service.predict.encode import count_off_road, encode
 from service.predict.input_warnings import HISTORY_S, add_warnings, code_name, code_names, memory_warnings
 from service.predict.plan import Plan, frames_of, make_plan, set_outcomes
+from service.predict.rasters.library import RasterLibrary
 from service.predict.request import Agents, Options, read_agents, read_options
 from service.predict.request_reader import EncodedRequest, RequestReader
 from service.predict.shadow import Shadow
@@ -71,6 +72,7 @@ class Pipeline:
         admission: Admission,
         batcher: Batcher,
         tracker: Tracker,
+        rasters: RasterLibrary,
         threads: Executor,
     ) -> None:
         self._settings = settings
@@ -79,6 +81,7 @@ class Pipeline:
         self._admission = admission
         self._batcher = batcher
         self._tracker = tracker
+        self._rasters = rasters
         self._threads = threads
         self._reader = RequestReader(threads)
         self.shadow: Shadow | None = None
@@ -138,13 +141,23 @@ class Pipeline:
             recalled: TrackingResult | None = None
             work = self._at_once if _is_light(message, options) else self._in_thread
             with self._admission.in_progress(call, options.predicted, options.priority):
+                # A map by its digest, which may be unknown; any other is read with the plan
+                raster = await self._rasters.find(message.scene_raster, call.remaining() - _RESERVE)
                 await self._admission.turn(call)
                 # Recall
                 if options.recalls:
                     agents, recalled = await self._recall(message, options, forecaster, catalog, call)
                 # Plan
                 plan = await work(
-                    call, make_plan, message, options, forecaster, catalog, self._settings, agents
+                    call,
+                    make_plan,
+                    message,
+                    options,
+                    forecaster,
+                    catalog,
+                    self._settings,
+                    agents,
+                    raster,
                 )
                 # Batch
                 await self._forecast(plan, call, work)

@@ -163,6 +163,7 @@ def make_plan(
     catalog: Catalog,
     settings: Settings,
     agents: Agents | None = None,
+    raster: Raster | None = None,
 ) -> Plan:
     """Read map and agents of a request and prepare its forwards. Takes milliseconds: run it in a thread.
 
@@ -173,12 +174,14 @@ def make_plan(
         catalog: the models, among them the fallback.
         settings: the limits.
         agents: the agents of the request, if they have been read before.
+        raster: the map, if the request names it by its digest; it is used as it is, without a copy.
 
     Raises:
         BadField: the map is invalid.
         BadFields: the call is strict, and an agent cannot be forecast as requested.
     """
-    raster = read_raster(request, settings)
+    if raster is None:
+        raster = read_raster(request, settings)
     if agents is None:
         agents = read_agents(request, settings)
     scene, rows, faults = _build_scene(request, agents, frames_of(forecaster, catalog), raster)

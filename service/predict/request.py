@@ -193,9 +193,15 @@ def read_raster(request: pb.PredictRequest, settings: Settings) -> Raster | None
     Raises:
         BadField: a field of the map is missing, out of its bounds, or contradicts another.
     """
-    if not request.HasField("scene_raster"):
-        return None
-    raster = request.scene_raster
+    return decode_raster(request.scene_raster, settings) if request.HasField("scene_raster") else None
+
+
+def decode_raster(raster: pb.SceneRaster, settings: Settings) -> Raster:
+    """Return a map whose message holds its image; its digest is not checked.
+
+    Raises:
+        BadField: a field of the map is missing, out of its bounds, or contradicts another.
+    """
     for number in _RASTER_NUMBERS:
         if not raster.HasField(number):
             raise BadField(f"scene_raster.{number}", "is required")

@@ -118,6 +118,25 @@ class Metrics:
         for reason in ("queue_full", "late", "dropped", "displaced", "concurrency", "bytes", "watchers"):
             self.refused.labels(reason)
         self.keys = KeyMetrics(self.registry)
+        self.raster_lookups = Counter(
+            "forecast_raster_lookups_total",
+            "Scene rasters with a digest by where they came from: sent whole; named by the digest alone and "
+            "found in memory or in Redis; or unknown.",
+            ["source"],
+            registry=self.registry,
+        )
+        for source in ("sent", "memory", "redis", "unknown"):
+            self.raster_lookups.labels(source)
+        self.raster_bytes = Gauge(
+            "forecast_raster_bytes",
+            "Size of the decoded scene rasters that are kept in memory.",
+            registry=self.registry,
+        )
+        self.rasters_dropped = Counter(
+            "forecast_rasters_dropped_total",
+            "Scene rasters dropped from memory to make room for others.",
+            registry=self.registry,
+        )
         self.model_info = Gauge(
             "forecast_model_info",
             "1 for each loaded model.",

@@ -103,7 +103,7 @@ async def test_redis_understands_its_options_and_all_that_is_in_it_expires() -> 
     require_redis()
     with single(*options) as redis:
         assert redis.command("CONFIG", "GET", "maxmemory-policy") == [b"maxmemory-policy", b"volatile-ttl"]
-        assert redis.command("CONFIG", "GET", "maxmemory") == [b"maxmemory", b"%d" % (512 * 2**20)]
+        assert redis.command("CONFIG", "GET", "maxmemory") == [b"maxmemory", b"%d" % (640 * 2**20)]
         assert redis.command("CONFIG", "GET", "save") == [b"save", b""]
         async with opened(redis.url) as store:
             watching = store.watch(scene)

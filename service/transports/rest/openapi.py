@@ -38,6 +38,7 @@ from service.errors import (
     Unauthenticated,
     Unavailable,
     UnknownModel,
+    UnknownRaster,
     UnknownTrack,
     UnsupportedMediaType,
 )
@@ -60,7 +61,15 @@ _ACCESS: _Errors = (Unauthenticated, PermissionDenied, LimitExceeded)
 _ALL_METHODS: _Errors = (*_ACCESS, NotAcceptable, Overloaded, Unavailable, Internal)
 """Errors that every method can return."""
 _ERRORS: dict[Route[Any, Any], _Errors] = {
-    PREDICT: (BadFields, UnknownModel, TooLarge, UnsupportedMediaType, RequestTimeout, DeadlineExceeded),
+    PREDICT: (
+        BadFields,
+        UnknownModel,
+        UnknownRaster,
+        TooLarge,
+        UnsupportedMediaType,
+        RequestTimeout,
+        DeadlineExceeded,
+    ),
     LIST_MODELS: (),
     GET_MODEL: (UnknownModel, NotFound, MethodNotAllowed),
     GET_AGENT_CONSISTENCY: (BadFields, UnknownTrack, TrackingUnavailable),

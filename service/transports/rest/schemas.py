@@ -1,5 +1,6 @@
 """JSON schemas of the contract's messages, from their descriptors and the comments of the .proto files."""
 
+import base64
 import functools
 import re
 from collections.abc import Iterable
@@ -9,6 +10,7 @@ from typing import Any
 from google.protobuf.descriptor import Descriptor, EnumDescriptor, FieldDescriptor
 
 from cab.forecast.v1.bounds import FIELD_BOUNDS, MAX_ID_LENGTH, STEP_SECONDS
+from cab.forecast.v1.digest import DIGEST_BYTES
 from cab.forecast.v1.routes import ROUTES
 from service.settings import Settings
 from service.tracking.store.base import WINDOW
@@ -16,6 +18,7 @@ from service.tracking.store.base import WINDOW
 Schema = dict[str, Any]
 
 _UINT32_MAX = 2**32 - 1
+_DIGEST_LENGTH = len(base64.b64encode(bytes(DIGEST_BYTES)))
 _SCALARS: dict[int, Schema] = {
     FieldDescriptor.TYPE_DOUBLE: {"type": "number", "format": "double"},
     FieldDescriptor.TYPE_BYTES: {"type": "string", "format": "byte"},
@@ -30,13 +33,16 @@ REQUIRED = {
     "Agent": ["id", "type", "states"],
     "AgentState": ["time", "x", "y"],
     "MapPatch": ["image"],
-    "SceneRaster": ["image", "origin_x", "origin_y", "pixels_per_meter"],
     "GetAgentConsistencyRequest": ["scene_id", "agent_id"],
     "GetSceneConsistencyRequest": ["scene_id"],
     "ResetSceneRequest": ["scene_id"],
     "WatchSceneRequest": ["scene_id"],
 }
 """Required fields by message. Descriptors cannot tell; the comments of the contract say it in words."""
+ALTERNATIVES = {
+    "SceneRaster": [["image", "origin_x", "origin_y", "pixels_per_meter"], ["digest"]],
+}
+"""Messages that require the fields of one of several lists."""
 
 _BLOCK = re.compile(r"(message|enum|service|oneof)\s+(\w+)\s*\{(\s*\})?")
 _RPC = re.compile(r"rpc\s+(\w+)\s*\(")
@@ -105,6 +111,7 @@ def bounds(settings: Settings) -> dict[str, Schema]:
         "Agent.states": {"minItems": 1, "maxItems": settings.max_states},
         "SceneRaster.rows": {"maximum": settings.max_raster_pixels},
         "SceneRaster.columns": {"maximum": settings.max_raster_pixels},
+        "SceneRaster.digest": {"minLength": _DIGEST_LENGTH, "maxLength": _DIGEST_LENGTH},
         "PredictOptions.samples": {"maximum": settings.max_samples},
         "PredictOptions.horizon": {"minimum": STEP_SECONDS, "multipleOf": STEP_SECONDS},
         "GetAgentConsistencyRequest.scene_id": an_id,
@@ -183,6 +190,8 @@ def _message(descriptor: Descriptor, is_request: bool, limits: dict[str, Schema]
     if is_request:
         required = REQUIRED.get(descriptor.name, [])
         schema["additionalProperties"] = False
+        if descriptor.name in ALTERNATIVES:
+            schema["anyOf"] = [{"required": fields} for fields in ALTERNATIVES[descriptor.name]]
     else:
         required = [field.name for field in descriptor.fields if not field.has_presence]
     if required:

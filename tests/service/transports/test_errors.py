@@ -103,6 +103,16 @@ async def test_unknown_model(call: Call, name: str) -> None:
         check(error, "NOT_FOUND", 404, "UNKNOWN_MODEL")
 
 
+async def test_unknown_raster(call: Call) -> None:
+    async with running() as server:
+        request = make_request()
+        request.scene_raster.digest = bytes(range(32))
+        error = await failure(call(server, request))
+        check(error, "FAILED_PRECONDITION", 412, "UNKNOWN_RASTER")
+        assert bytes(range(32)).hex() in error.message
+        assert error.retry_after is None
+
+
 @pytest.mark.parametrize(
     ("error", "row"),
     [

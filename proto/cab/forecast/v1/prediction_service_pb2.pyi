@@ -193,8 +193,8 @@ class PredictRequest(_message.Message):
 
     @_builtins.property
     def scene_raster(self) -> Global___SceneRaster:
-        """The map around the agents. Optional; an agent's own map_patch goes before it. Without either a
-        model that uses the map sees an unknown map (neither road nor not road).
+        """The map around the agents, whole or by its digest. Optional; an agent's own map_patch goes before it.
+        Without either a model that uses the map sees an unknown map (neither road nor not road).
         """
 
     @_builtins.property
@@ -440,6 +440,11 @@ class SceneRaster(_message.Message):
     """The map of the whole scene. Row i, column j shows the ground point
     (origin_x + i / pixels_per_meter, origin_y + j / pixels_per_meter): rows run along x, columns along y.
     Beyond its edges nothing is known to models in the agent's frame; older models take it for not driveable.
+
+    A raster that was sent once with its digest can be named by the digest alone in later calls; all other
+    fields are then left out. A server keeps rasters for a while only, the most recently used ones. One that it
+    does not have, or not any more, fails the call with FAILED_PRECONDITION (reason UNKNOWN_RASTER): send the
+    raster whole, with its digest, in the same call again.
     """
 
     DESCRIPTOR: _descriptor.Descriptor
@@ -450,6 +455,7 @@ class SceneRaster(_message.Message):
     ORIGIN_X_FIELD_NUMBER: _builtins.int
     ORIGIN_Y_FIELD_NUMBER: _builtins.int
     PIXELS_PER_METER_FIELD_NUMBER: _builtins.int
+    DIGEST_FIELD_NUMBER: _builtins.int
     rows: _builtins.int
     """Needed with packed_bits; with a PNG optional, and then checked. At most 4096 · 4096 pixels by default."""
     columns: _builtins.int
@@ -459,6 +465,17 @@ class SceneRaster(_message.Message):
     pixels_per_meter: _builtins.float
     """Required, within 0.1 … 100. Patches have 3; of a raster twice as fine or finer, a coarser pixel is set
     where any of its own is.
+    """
+    digest: _builtins.bytes
+    """SHA-256, 32 bytes, of the following one after the other, numbers in little-endian order:
+    1 byte: the encoding of the image, 1 for packed_bits, 2 for png;
+    4 bytes each: rows, columns as unsigned integers, 0 where the field is not set;
+    8 bytes each: origin_x, origin_y, pixels_per_meter as IEEE 754 doubles;
+    the bytes of packed_bits or png as they stand in this message.
+    Example: of the packed_bits AB C0 (hexadecimal) with rows 2, columns 2, origin (-1.5, 2.5) and 3 pixels
+    per metre it is 3e8cc400762a2b87f8d46533d038babc608ae53bc29db6a86af9e2c384719672.
+    Optional. With an image the server checks it (a wrong one is a bad field) and keeps the raster for later
+    calls; a raster without a digest is not kept.
     """
     @_builtins.property
     def image(self) -> Global___LayerImage: ...
@@ -471,10 +488,11 @@ class SceneRaster(_message.Message):
         origin_x: _builtins.float | None = ...,
         origin_y: _builtins.float | None = ...,
         pixels_per_meter: _builtins.float | None = ...,
+        digest: _builtins.bytes = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["_origin_x", b"_origin_x", "_origin_y", b"_origin_y", "_pixels_per_meter", b"_pixels_per_meter", "image", b"image", "origin_x", b"origin_x", "origin_y", b"origin_y", "pixels_per_meter", b"pixels_per_meter"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["_origin_x", b"_origin_x", "_origin_y", b"_origin_y", "_pixels_per_meter", b"_pixels_per_meter", "columns", b"columns", "image", b"image", "origin_x", b"origin_x", "origin_y", b"origin_y", "pixels_per_meter", b"pixels_per_meter", "rows", b"rows"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["_origin_x", b"_origin_x", "_origin_y", b"_origin_y", "_pixels_per_meter", b"_pixels_per_meter", "columns", b"columns", "digest", b"digest", "image", b"image", "origin_x", b"origin_x", "origin_y", b"origin_y", "pixels_per_meter", b"pixels_per_meter", "rows", b"rows"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     _WhichOneofReturnType__origin_x: _TypeAlias = _typing.Literal["origin_x"]  # noqa: Y015
     _WhichOneofArgType__origin_x: _TypeAlias = _typing.Literal["_origin_x", b"_origin_x"]  # noqa: Y015

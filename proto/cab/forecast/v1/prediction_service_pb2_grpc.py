@@ -37,6 +37,7 @@ class PredictionServiceStub:
     INVALID_ARGUMENT    a bad field, named
     UNAUTHENTICATED     credentials missing or wrong
     NOT_FOUND           no such model
+    FAILED_PRECONDITION no raster with the digest is kept (reason UNKNOWN_RASTER): send the raster whole
     RESOURCE_EXHAUSTED  the queue is full (reason OVERLOADED, with RetryInfo), or the request exceeds
     a size limit (reason TOO_LARGE, no RetryInfo: do not retry)
     DEADLINE_EXCEEDED   the deadline passed before a forecast was made
@@ -72,6 +73,7 @@ class PredictionServiceServicer:
     INVALID_ARGUMENT    a bad field, named
     UNAUTHENTICATED     credentials missing or wrong
     NOT_FOUND           no such model
+    FAILED_PRECONDITION no raster with the digest is kept (reason UNKNOWN_RASTER): send the raster whole
     RESOURCE_EXHAUSTED  the queue is full (reason OVERLOADED, with RetryInfo), or the request exceeds
     a size limit (reason TOO_LARGE, no RetryInfo: do not retry)
     DEADLINE_EXCEEDED   the deadline passed before a forecast was made
@@ -117,6 +119,7 @@ class PredictionService:
     INVALID_ARGUMENT    a bad field, named
     UNAUTHENTICATED     credentials missing or wrong
     NOT_FOUND           no such model
+    FAILED_PRECONDITION no raster with the digest is kept (reason UNKNOWN_RASTER): send the raster whole
     RESOURCE_EXHAUSTED  the queue is full (reason OVERLOADED, with RetryInfo), or the request exceeds
     a size limit (reason TOO_LARGE, no RetryInfo: do not retry)
     DEADLINE_EXCEEDED   the deadline passed before a forecast was made

@@ -45,14 +45,15 @@ class SceneKeys:
 
 
 class Script:
-    """Lua script of this package; it is loaded again if Redis has forgotten it.
+    """Lua script; it is loaded again if Redis has forgotten it.
 
     Args:
         name: file name.
+        package: package that contains the file.
     """
 
-    def __init__(self, name: str) -> None:
-        self._text = (resources.files("service.tracking.store.redis") / name).read_text(encoding="utf-8")
+    def __init__(self, name: str, package: str = "service.tracking.store.redis") -> None:
+        self._text = (resources.files(package) / name).read_text(encoding="utf-8")
         self._digest = hashlib.sha1(self._text.encode(), usedforsecurity=False).hexdigest()
 
     async def run(self, client: Any, keys: Sequence[str], arguments: Sequence[str | bytes | int]) -> Any:

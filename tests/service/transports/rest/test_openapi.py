@@ -14,7 +14,7 @@ from service.settings import Settings
 from service.tracking.store.base import WINDOW
 from service.transports.rest.codec import to_dict
 from service.transports.rest.openapi import EXAMPLE_IDS, openapi_document, predict_examples, reset_examples
-from service.transports.rest.schemas import REQUIRED, bounds, comments, parse_comments
+from service.transports.rest.schemas import ALTERNATIVES, REQUIRED, bounds, comments, parse_comments
 from tests.service.fakes import FakeForecaster
 from tests.service.servers import running
 
@@ -73,6 +73,9 @@ def test_schemas_have_the_messages_fields() -> None:
     assert SCHEMAS["AgentType"]["enum"][1] == "AGENT_TYPE_VEHICLE"
     assert SCHEMAS["Model"]["properties"]["benchmark"]["additionalProperties"]["type"] == "number"
     assert SCHEMAS["LayerImage"]["oneOf"] == [{"required": ["packed_bits"]}, {"required": ["png"]}]
+    whole, named = SCHEMAS["SceneRaster"]["anyOf"]
+    assert named == {"required": ["digest"]}
+    assert "image" in whole["required"]
     assert "weights" in SCHEMAS["AgentForecast"]["required"]
     assert "model" not in SCHEMAS["AgentForecast"]["required"]
 
@@ -81,6 +84,9 @@ def test_hand_written_parts_name_real_fields() -> None:
     messages = {name: kind for file in FILES for name, kind in file.message_types_by_name.items()}
     for name, fields in REQUIRED.items():
         assert set(fields) <= {field.name for field in messages[name].fields}
+    for name, alternatives in ALTERNATIVES.items():
+        for fields in alternatives:
+            assert set(fields) <= {field.name for field in messages[name].fields}
     for path in bounds(Settings()):
         name, _, field = path.partition(".")
         assert field in messages[name].fields_by_name
@@ -139,6 +145,7 @@ def test_errors_are_documented() -> None:
         "404",
         "406",
         "408",
+        "412",
         "413",
         "415",
         "422",
