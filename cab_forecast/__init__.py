@@ -24,10 +24,12 @@ if TYPE_CHECKING:
         TrackingUnavailable,
         Unauthenticated,
         Unavailable,
+        UnknownRaster,
         UnknownTrack,
         Untrusted,
     )
     from cab_forecast.forecast import Forecast, InputWarning, Status, Tracking, forecasts, tracking
+    from cab_forecast.rasters import raster_digest
     from cab_forecast.requests import agent, map_patch, predict_request, scene_raster
     from cab_forecast.streams import AsyncStream, Stream
 
@@ -53,6 +55,7 @@ __all__ = [
     "TrackingUnavailable",
     "Unauthenticated",
     "Unavailable",
+    "UnknownRaster",
     "UnknownTrack",
     "Untrusted",
     "agent",
@@ -60,6 +63,7 @@ __all__ = [
     "forecasts",
     "map_patch",
     "predict_request",
+    "raster_digest",
     "scene_raster",
     "tracking",
 ]
@@ -76,6 +80,7 @@ _MODULES = {
     "Tracking": "forecast",
     "forecasts": "forecast",
     "tracking": "forecast",
+    "raster_digest": "rasters",
     "agent": "requests",
     "map_patch": "requests",
     "predict_request": "requests",

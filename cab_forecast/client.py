@@ -45,6 +45,8 @@ from cab_forecast.connection import (
     from_variables,
 )
 from cab_forecast.endpoints import DEFAULT_ENDPOINT
+from cab_forecast.errors import UnknownRaster
+from cab_forecast.rasters import RasterDigests
 from cab_forecast.streams import AsyncStream, OpenStream, Stream
 from cab_forecast.timing import RETRY, WAIT, Budget, stop_condition
 
@@ -67,6 +69,7 @@ class Client:
         ca_file: str | PathLike[str] | None = None,
         certificate_file: str | PathLike[str] | None = None,
         key_file: str | PathLike[str] | None = None,
+        map_by_digest: bool = True,
     ) -> None:
         """Create a client; it connects at the first call.
 
@@ -80,6 +83,9 @@ class Client:
             ca_file: PEM certificates to trust instead of the system's.
             certificate_file: PEM certificate of this client, for servers that require one.
             key_file: PEM private key of that certificate.
+            map_by_digest: whether to name a scene raster of 4 kB or more by its digest if it was sent before.
+                One that the server does not have is sent whole in the same call. False: each request is sent as
+                it is.
 
         Raises:
             ValueError: an argument is out of range.
@@ -96,6 +102,7 @@ class Client:
             key_file=key_file,
         )
         self._transport = _connect(self._settings.connection)
+        self._rasters = RasterDigests() if map_by_digest else None
 
     @classmethod
     def from_environment(cls, **arguments: Any) -> Self:
@@ -123,7 +130,19 @@ class Client:
         Raises:
             ForecastError: the call failed; the subclass says why.
         """
-        return self._call(PREDICT, request, timeout)
+        budget = self._settings.budget(timeout)
+        if self._rasters is None:
+            return self._send(PREDICT, request, budget)
+        sending = self._rasters.prepare(request)
+        try:
+            response = self._send(PREDICT, sending.request, budget)
+        except UnknownRaster:
+            if not sending.named:
+                raise
+            sending = self._rasters.whole(request, sending)
+            response = self._send(PREDICT, sending.request, budget)
+        self._rasters.answered(sending)
+        return response
 
     def list_models(self, timeout: float | None = None) -> list[Model]:
         """Return all loaded models, by name and version.
@@ -245,7 +264,9 @@ class Client:
         self.close()
 
     def _call(self, route: Route[Request, Response], request: Request, timeout: float | None) -> Response:
-        budget = self._settings.budget(timeout)
+        return self._send(route, request, self._settings.budget(timeout))
+
+    def _send(self, route: Route[Request, Response], request: Request, budget: Budget) -> Response:
         response: Response = self._retrying(budget)(self._transport.call, route, request, budget)
         return response
 
@@ -269,6 +290,7 @@ class AsyncClient:
         ca_file: str | PathLike[str] | None = None,
         certificate_file: str | PathLike[str] | None = None,
         key_file: str | PathLike[str] | None = None,
+        map_by_digest: bool = True,
     ) -> None:
         """See ``Client``."""
         self._settings = ClientSettings(
@@ -283,6 +305,7 @@ class AsyncClient:
         )
         # Opened at the first call, because a channel belongs to the event loop that it is created in.
         self._transport: AsyncTransport | None = None
+        self._rasters = RasterDigests() if map_by_digest else None
 
     @classmethod
     def from_environment(cls, **arguments: Any) -> Self:
@@ -291,7 +314,19 @@ class AsyncClient:
 
     async def predict(self, request: PredictRequest, timeout: float | None = None) -> PredictResponse:  # noqa: ASYNC109 - it goes to the server, too
         """See ``Client.predict``."""
-        return await self._call(PREDICT, request, timeout)
+        budget = self._settings.budget(timeout)
+        if self._rasters is None:
+            return await self._send(PREDICT, request, budget)
+        sending = self._rasters.prepare(request)
+        try:
+            response = await self._send(PREDICT, sending.request, budget)
+        except UnknownRaster:
+            if not sending.named:
+                raise
+            sending = self._rasters.whole(request, sending)
+            response = await self._send(PREDICT, sending.request, budget)
+        self._rasters.answered(sending)
+        return response
 
     async def list_models(self, timeout: float | None = None) -> list[Model]:  # noqa: ASYNC109
         """See ``Client.list_models``."""
@@ -368,7 +403,9 @@ class AsyncClient:
         request: Request,
         timeout: float | None,  # noqa: ASYNC109
     ) -> Response:
-        budget = self._settings.budget(timeout)
+        return await self._send(route, request, self._settings.budget(timeout))
+
+    async def _send(self, route: Route[Request, Response], request: Request, budget: Budget) -> Response:
         transport = self._open_transport()
         response: Response = await self._retrying(budget)(transport.call, route, request, budget)
         return response

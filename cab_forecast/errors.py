@@ -91,6 +91,12 @@ class UnknownTrack(NotFound):
     """The server has no track of that scene or agent."""
 
 
+class UnknownRaster(ForecastError):  # noqa: N818
+    """The server has no raster with the digest that the request names, without an image."""
+
+    default_code = "FAILED_PRECONDITION"
+
+
 class TooLarge(ForecastError):  # noqa: N818
     """The request exceeds a size limit of the server; a retry cannot succeed."""
 
@@ -168,6 +174,7 @@ _BY_REASON: dict[tuple[str, str], type[ForecastError]] = {
     ("RESOURCE_EXHAUSTED", TOO_LARGE): TooLarge,
     ("RESOURCE_EXHAUSTED", "LIMIT_EXCEEDED"): LimitExceeded,
     ("NOT_FOUND", "UNKNOWN_TRACK"): UnknownTrack,
+    ("FAILED_PRECONDITION", "UNKNOWN_RASTER"): UnknownRaster,
     ("UNAVAILABLE", "TRACKING_UNAVAILABLE"): TrackingUnavailable,
 }
 """Exceptions that differ from others with the same code by their reason."""

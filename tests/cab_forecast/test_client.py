@@ -27,6 +27,7 @@ from cab_forecast import (
     TooLarge,
     Unauthenticated,
     Unavailable,
+    UnknownRaster,
     demo_request,
 )
 from tests.cab_forecast.answers import answer
@@ -54,6 +55,7 @@ ROWS = [
     ),
     (Failure("UNAUTHENTICATED", 401, "UNAUTHENTICATED"), Unauthenticated),
     (Failure("NOT_FOUND", 404, "UNKNOWN_MODEL"), NotFound),
+    (Failure("FAILED_PRECONDITION", 412, "UNKNOWN_RASTER"), UnknownRaster),
     (Failure("RESOURCE_EXHAUSTED", 413, "TOO_LARGE"), TooLarge),
     (Failure("RESOURCE_EXHAUSTED", 429, "OVERLOADED", retry_after=0.25), Overloaded),
     (Failure("DEADLINE_EXCEEDED", 504, "DEADLINE_EXCEEDED"), DeadlineExceeded),
