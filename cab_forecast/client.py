@@ -84,8 +84,8 @@ class Client:
             certificate_file: PEM certificate of this client, for servers that require one.
             key_file: PEM private key of that certificate.
             map_by_digest: whether to name a scene raster of 4 kB or more by its digest if it was sent before.
-                One that the server does not have is sent whole in the same call. False: each request is sent as
-                it is.
+                One that the server does not have is sent whole in the same call. False: requests are sent
+                as they are.
 
         Raises:
             ValueError: an argument is out of range.

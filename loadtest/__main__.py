@@ -14,7 +14,7 @@ import typer
 
 import model
 from loadtest.report import Report
-from loadtest.requests import Encoding
+from loadtest.requests import Encoding, Map
 from loadtest.scenarios import SCENARIOS
 from loadtest.session import Options, opened
 from loadtest.wire import Transport
@@ -31,7 +31,7 @@ async def run(names: list[str], options: Options) -> Report:
         body = len(session.requests[0].body)
     setup = [
         f"model {options.model}, {options.agents} agents a call, all modes, {options.transport}, "
-        f"{options.encoding}, requests of {body} bytes",
+        f"{options.encoding}, requests of {body} bytes with the map as {options.map}",
         f"{'Poisson' if options.poisson else 'even'} arrivals; latencies count from the scheduled time",
         f"{os.cpu_count()} cores, {platform.machine()}; server and clients share this machine"
         if session.owns_server
@@ -55,6 +55,9 @@ def main(
     ] = None,
     transport: Annotated[Transport, typer.Option()] = Transport.GRPC,
     encoding: Annotated[Encoding, typer.Option(help="of the bodies over REST")] = Encoding.PROTOBUF,
+    form: Annotated[
+        Map, typer.Option("--map", help="the whole raster in each call, or its digest")
+    ] = Map.RASTER,
     name: Annotated[str, typer.Option("--model", help="requested model")] = "cab",
     models: Annotated[
         Path | None, typer.Option(help="folder of checkpoints; default: the bundled one")
@@ -92,6 +95,7 @@ def main(
         deadline=deadline,
         transport=transport,
         encoding=encoding,
+        map=form,
         poisson=not even,
         grpc=endpoint,
         http=http,

@@ -23,6 +23,7 @@ SAMPLED = 24
 _FIRST_BACKOFF = 0.05
 _MAX_BACKOFF = 0.5
 _MIN_TIMEOUT = 1e-3
+_UNKNOWN_RASTER = "FAILED_PRECONDITION"
 _RETRIED = ("UNAVAILABLE", "RESOURCE_EXHAUSTED")
 
 
@@ -87,6 +88,10 @@ def poisson(rate: float, seconds: float, start: float = 0.0, seed: int = 0) -> F
     Given their number, the times of a Poisson process are independent and uniform.
     """
     return start + np.sort(np.random.default_rng(seed).uniform(0, seconds, round(rate * seconds)))
+
+
+def _timeout(time_left: float | None) -> float | None:
+    return None if time_left is None else max(time_left, _MIN_TIMEOUT)
 
 
 class Generator:
@@ -187,8 +192,12 @@ class _Run:
 
     async def once(self, call: Call, time_left: float | None) -> None:
         """Send a call once."""
-        body = self._requests[call.request].body
-        reply = await self._wire.call(body, None if time_left is None else max(time_left, _MIN_TIMEOUT))
+        request = self._requests[call.request]
+        begin = self.now()
+        reply = await self._wire.call(request.body, _timeout(time_left))
+        if reply.code == _UNKNOWN_RASTER and request.whole:
+            left = None if time_left is None else time_left - (self.now() - begin)
+            reply = await self._wire.call(request.whole, _timeout(left))
         call.done, call.code = self.now(), reply.code
         if reply.code == "OK":
             self._keep(call, reply.body)

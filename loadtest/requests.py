@@ -11,8 +11,8 @@ import torch
 from google.protobuf import json_format
 from google.protobuf.message import DecodeError, Message
 
-from cab.forecast.v1.prediction_service_pb2 import PredictRequest, PredictResponse
-from cab_forecast import predict_request, scene_raster
+from cab.forecast.v1.prediction_service_pb2 import PredictRequest, PredictResponse, SceneRaster
+from cab_forecast import predict_request, raster_digest, scene_raster
 from loadtest.forward import paired_seconds
 from loadtest.traffic import START, STEP, Traffic
 from model.arrays import Bytes, Floats
@@ -53,16 +53,33 @@ class Encoding(StrEnum):
         return "application/json" if self is Encoding.JSON else "application/x-protobuf"
 
 
+class Map(StrEnum):
+    """Forms of the map in requests."""
+
+    RASTER = "raster"
+    """The whole raster in each call."""
+    DIGEST = "digest"
+    """Its digest; the raster is sent whole only to a server that does not have it."""
+
+
 @dataclass(frozen=True)
 class Request:
-    """A request and its encoded form."""
+    """A request and its encoded forms."""
 
     message: PredictRequest
+    """The request with its whole raster."""
     body: bytes
+    """Body to send."""
+    whole: bytes = b""
+    """Body for a server that does not have the raster; empty: the raster is in each body."""
 
 
 def made_up_requests(
-    model: str, agents: int, encoding: Encoding = Encoding.PROTOBUF, scenes: int = SCENES
+    model: str,
+    agents: int,
+    encoding: Encoding = Encoding.PROTOBUF,
+    form: Map = Map.RASTER,
+    scenes: int = SCENES,
 ) -> list[Request]:
     """Return requests of different scenes, each with vehicles and a raster, for all modes.
 
@@ -70,6 +87,7 @@ def made_up_requests(
         model: requested model.
         agents: vehicles per scene.
         encoding: encoding of the bodies.
+        form: form of the map in the bodies.
         scenes: number of scenes.
     """
     requests = []
@@ -82,8 +100,19 @@ def made_up_requests(
             raster=scene_raster(_roads(seed), (0.0, 0.0), 1.0),
             merge=False,
         )
-        requests.append(Request(message, encode(message, encoding)))
+        requests.append(_encoded(message, encoding, form))
     return requests
+
+
+def _encoded(message: PredictRequest, encoding: Encoding, form: Map) -> Request:
+    if form is Map.RASTER:
+        return Request(message, encode(message, encoding))
+    digest = raster_digest(message.scene_raster)
+    message.scene_raster.digest = digest
+    named = PredictRequest()
+    named.CopyFrom(message)
+    named.scene_raster.CopyFrom(SceneRaster(digest=digest))
+    return Request(message, encode(named, encoding), encode(message, encoding))
 
 
 def encode(message: Message, encoding: Encoding) -> bytes:

@@ -13,7 +13,7 @@ import psutil
 
 from loadtest.generator import Calls, Generator, Load, even, poisson
 from loadtest.redis_servers import HOST, free_port
-from loadtest.requests import Encoding, ForwardInProcess, Request, made_up_requests
+from loadtest.requests import Encoding, ForwardInProcess, Map, Request, made_up_requests
 from loadtest.results import Observer, Result
 from loadtest.servers import Server, serving
 from loadtest.wire import Transport, Wire, connect
@@ -60,6 +60,8 @@ class Options:
     transport: Transport = Transport.GRPC
     encoding: Encoding = Encoding.PROTOBUF
     """Encoding of the bodies; gRPC has protobuf only."""
+    map: Map = Map.RASTER
+    """Form of the map in the bodies."""
     poisson: bool = True
     """Switch for calls at random times; False: at even intervals."""
     grpc: str | None = None
@@ -95,7 +97,9 @@ class Session:
         self._grpc = options.grpc or f"{HOST}:{free_port()}"
         self._http = options.http or f"{HOST}:{free_port()}"
         self._usual = 0.0
-        self.requests: list[Request] = made_up_requests(options.model, options.agents, options.encoding)
+        self.requests: list[Request] = made_up_requests(
+            options.model, options.agents, options.encoding, options.map
+        )
         self.forward = ForwardInProcess(options.models, options.model, self.requests)
 
     @property

@@ -31,6 +31,7 @@ _OPTIONS = (
 )
 _CODES: Mapping[int, str] = {
     200: "OK",
+    412: "FAILED_PRECONDITION",
     429: "RESOURCE_EXHAUSTED",
     503: "UNAVAILABLE",
     504: "DEADLINE_EXCEEDED",

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from loadtest.requests import Encoding
+from loadtest.requests import Encoding, Map
 from loadtest.results import Result
 from loadtest.scenarios import SCENARIOS
 from loadtest.session import Options, Session, opened
@@ -67,6 +67,12 @@ async def test_what_is_accepted_is_answered_and_right(options: Options) -> None:
 
         [overload] = await run(session, "overload", rate=None, peak=None, peak_seconds=0.5, deadline=2.0)
         assert overload.counts["in time"] > overload.counts["late"]
+
+        by_digest = replace(options, map=Map.DIGEST, grpc=session.grpc, http=session.http)
+        async with opened(by_digest) as guest:
+            [steady] = await run(guest, "steady")
+            assert steady.counts == {"in time": 20}
+            assert len(guest.requests[0].body) < len(guest.requests[0].whole) / 10
 
         json = replace(options, transport=Transport.REST, encoding=Encoding.JSON)
         async with opened(replace(json, grpc=session.grpc, http=session.http)) as guest:
