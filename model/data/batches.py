@@ -15,7 +15,7 @@ from model.data.patches import PatchCutter
 from model.data.scenes import DataError
 from model.forecaster import Features
 from model.geometry import rotate as rotate_vectors
-from model.networks.config import AnyNetworkConfig, NetworkConfig
+from model.networks.config import AnyNetworkConfig
 from model.scenes.scene import AgentType
 
 
@@ -165,7 +165,7 @@ def _leaving(cache: Cache) -> Bools:
 def _packed_patches(cache: Cache, config: AnyNetworkConfig | None) -> dict[str, Tensor]:
     """Return the packed map patches that a network of the agent's frame uses, by feature."""
     near = config is None or config.uses_map
-    far = config is None or (isinstance(config, NetworkConfig) and config.far_map)
+    far = config is None or config.far_map
     arrays = {"map": cache.near_patch if near else None, "far_map": cache.far_patch if far else None}
     return {name: torch.from_numpy(array) for name, array in arrays.items() if array is not None}
 
