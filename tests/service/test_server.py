@@ -318,9 +318,7 @@ async def test_stop_waits_for_no_health_watch() -> None:
         assert caught.value.code() is grpc.StatusCode.UNAVAILABLE
 
 
-@pytest.mark.parametrize(
-    ("tokens", "told"), [((), "off: every caller is accepted"), (("t",), "bearer tokens")]
-)
+@pytest.mark.parametrize(("tokens", "told"), [((), "off: every caller is accepted"), (("t",), "keys")])
 async def test_the_log_says_who_is_let_in(tokens: tuple[str, ...], told: str) -> None:
     with capture_logs() as logs:
         async with running(FakeForecaster(), api_tokens=tokens):
