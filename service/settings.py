@@ -155,6 +155,17 @@ class Settings(BaseSettings):
     """Engine of the forward: ``onnxruntime`` runs networks of the agent's frame as one native call and all
     other models in PyTorch; ``eager`` runs all models in PyTorch."""
 
+    record: Path | None = None
+    """Folder to which calls and their answers are recorded, for `cab-forecast replay` and Foxglove; not set:
+    nothing is recorded. It needs the extra `record`, and each replica a folder of its own. Recordings hold
+    where road users were: see docs/recording.md."""
+    record_share: float = Field(default=1.0, gt=0, le=1)
+    """Share of the answered calls that are recorded, drawn at random."""
+    record_file_bytes: int = Field(default=128 * 2**20, ge=2**20)
+    """Max size of a file of the recording."""
+    record_files: int = Field(default=16, ge=2)
+    """Max number of files in the folder of the recording; the oldest ones are deleted."""
+
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     """Least severe level that is logged."""
     log_json: bool = False

@@ -19,6 +19,7 @@ from service.predict.rasters.shared import SharedRasters
 from service.predict.reload import Load, Reloader
 from service.predict.shadow import Shadow
 from service.predict.torch_threads import set_helper_threads
+from service.recording.factory import make_recorder
 from service.settings import Settings, split_shadow
 from service.telemetry.metrics import Metrics
 from service.tracking.collector import ConsistencyCollector, StoreMetrics
@@ -31,6 +32,8 @@ from service.tracking.tracker import Tracker
 _log = structlog.get_logger(__name__)
 
 _MAX_WORKERS = 8
+_RECORDER_SECONDS = 5.0
+"""Seconds that a recording gets to end."""
 
 
 class DataPlane:
@@ -123,9 +126,10 @@ class DataPlane:
             load: reads the models; called in a thread.
 
         Raises:
-            SettingsError: a required model is missing.
+            SettingsError: a required model is missing, or calls cannot be recorded.
             Exception: any exception of ``load``.
         """
+        self._pipeline.recorder = make_recorder(self._settings, self._metrics)
         self._reloader = Reloader(load, self._settings, self._batcher, self._metrics, self._take_over)
         self._batcher.start(self._lifecycle.fail)
         await self._reloader.start()
@@ -211,6 +215,8 @@ class DataPlane:
         if self._pipeline.shadow is not None:
             await self._pipeline.shadow.close()
         await self._batcher.stop()
+        if self._pipeline.recorder is not None:
+            await asyncio.to_thread(self._pipeline.recorder.close, _RECORDER_SECONDS)
         await self._guard.close()
         if self._shadow_guard is not None:
             await self._shadow_guard.close()

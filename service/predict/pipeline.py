@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
-from typing import Protocol, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import structlog
 
@@ -38,6 +38,9 @@ from service.settings import Settings
 from service.telemetry.metrics import Metrics
 from service.tracking.tracker import Tracker, TrackingResult
 
+if TYPE_CHECKING:
+    from service.recording.recorder import Recorder
+
 _log = structlog.get_logger(__name__)
 
 _T = TypeVar("_T")
@@ -63,6 +66,8 @@ class Pipeline:
 
     catalog: Catalog
     """Models that calls begin with; set before the lifecycle becomes ready, and by reloads."""
+    recorder: "Recorder | None" = None
+    """Recorder of answered calls, if any; set before the lifecycle becomes ready."""
 
     def __init__(
         self,
@@ -175,6 +180,9 @@ class Pipeline:
         self._count_warnings(response)
         if self.shadow is not None:
             call.when_sent = functools.partial(self.shadow.offer, message, plan, catalog)
+        if self.recorder is not None:
+            raster = None if plan.scene is None else plan.scene.raster
+            self.recorder.record(message, response, raster, {} if recalled is None else recalled.histories)
         return response
 
     async def _recall(

@@ -137,6 +137,19 @@ class Metrics:
             "Scene rasters dropped from memory to make room for others.",
             registry=self.registry,
         )
+        self.recording = Gauge(
+            "forecast_recording",
+            "1 while answered calls are recorded, 0 while they are not.",
+            registry=self.registry,
+        )
+        self.recorded_calls = Counter(
+            "forecast_recorded_calls_total",
+            "Answered calls drawn for the recording, by what became of them there.",
+            ["result"],
+            registry=self.registry,
+        )
+        for result in ("written", "queue_full", "disk_full", "too_large", "failed"):
+            self.recorded_calls.labels(result)
         self.model_info = Gauge(
             "forecast_model_info",
             "1 for each loaded model.",

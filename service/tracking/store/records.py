@@ -112,6 +112,12 @@ def unpack_observations(packed: list[bytes]) -> Observations:
     )
 
 
+def split_observations(packed: bytes) -> list[list[float]]:
+    """Return the observations of one agent: a row of ``OBSERVATION_FIELDS`` numbers each."""
+    rows: list[list[float]] = np.frombuffer(packed, dtype="<f8").reshape(-1, OBSERVATION_FIELDS).tolist()
+    return rows
+
+
 def pack_forecasts(mixture: TrajectoryMixture) -> list[bytes]:
     """Return the forecast of each agent: ``FORECAST_BLOCKS`` blocks, NaN after the last step.
 
