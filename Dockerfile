@@ -8,10 +8,12 @@ COPY service service
 COPY cli cli
 COPY cab_forecast cab_forecast
 COPY benchmark benchmark
+# For example [record], with the brackets: extras of pyproject.toml that the server is to have
+ARG EXTRAS=""
 # The CPU build of torch; the default build adds gigabytes of CUDA libraries
 RUN python -m venv /opt/cab-forecast \
  && /opt/cab-forecast/bin/pip install --no-cache-dir --disable-pip-version-check \
-      --extra-index-url https://download.pytorch.org/whl/cpu -c constraints.txt .
+      --extra-index-url https://download.pytorch.org/whl/cpu -c constraints.txt ".${EXTRAS}"
 
 FROM python:3.11-slim
 RUN useradd --system --uid 10001 --no-create-home forecast

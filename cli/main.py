@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from cli import benchmark, consistency, convert, doctor, evaluate, keys, predict, reload, serve, train
+from cli import benchmark, consistency, convert, doctor, evaluate, keys, predict, reload, replay, serve, train
 
 app = typer.Typer(
     name="cab-forecast",
@@ -34,6 +34,7 @@ serve.register(app)
 doctor.register(app)
 predict.register(app)
 reload.register(app)
+replay.register(app)
 consistency.register(app)
 keys.register(app)
 convert.register(app)

@@ -34,7 +34,7 @@ def make_recorder(settings: Settings, metrics: Metrics) -> "Recorder | None":
         ) from error
     path = settings.record
     try:
-        path.mkdir(parents=True, exist_ok=True)
+        path.mkdir(0o700, parents=True, exist_ok=True)
         probe = path / ".probe"
         probe.touch()
         probe.unlink()

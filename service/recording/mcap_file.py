@@ -47,7 +47,7 @@ class McapFile:
         self._pending = _Pending()
         self._writer = Writer(self._pending, chunk_size=_NEVER, compression=CompressionType.ZSTD)
         self._writer.start(library=library)
-        self._file = path.open("xb", buffering=0)
+        self._file = io.FileIO(path, "xb", opener=_open_privately)
         try:
             self._commit()
         except OSError:
@@ -118,6 +118,11 @@ class McapFile:
             with suppress(OSError):
                 os.ftruncate(self._file.fileno(), end)
             raise
+
+
+def _open_privately(path: str, flags: int) -> int:
+    """Open a file that its owner alone may read: it tells where people were."""
+    return os.open(path, flags, 0o600)
 
 
 def _chunk_bytes(messages: Sequence[TopicMessage]) -> int:

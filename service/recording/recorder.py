@@ -53,6 +53,8 @@ class Recorder:
         self._paused = False
         self._warned = False
         """Flag for a pause that has been logged, and whose end has not."""
+        self._resumed: float | None = None
+        """Monotonic time of the first call written after a pause, s."""
         self._failed = False
         """Flag for a failure that has been logged."""
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
@@ -135,18 +137,25 @@ class Recorder:
                 _log.exception("call not recorded; further ones are counted only")
         else:
             self._count("written")
-            self._goes_on()
+            self._check_lasting()
 
     def _pause(self, error: OSError) -> None:
         self._folder.abandon()
         self._paused = True
+        self._resumed = None
         self._metrics.recording.set(0)
         if not self._warned:
             self._warned = True
             _log.warning("recording paused until there is room", error=error.strerror or str(error))
 
-    def _goes_on(self) -> None:
-        if self._warned:
+    def _check_lasting(self) -> None:
+        """Log the end of a pause once it lasts; a disk at its limit takes a few calls after every pause."""
+        if not self._warned:
+            return
+        now = time.monotonic()
+        if self._resumed is None:
+            self._resumed = now
+        elif now >= self._resumed + self._retry_seconds:
             self._warned = False
             self._metrics.recording.set(1)
             _log.warning("recording goes on")

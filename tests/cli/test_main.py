@@ -32,6 +32,7 @@ def test_help_names_the_commands_and_loads_nothing_heavy() -> None:
         "doctor",
         "predict",
         "reload",
+        "replay",
         "consistency",
         "convert",
         "train",
