@@ -1,9 +1,9 @@
 """One MCAP file of a recording."""
 
-import io
 import os
 from collections.abc import Sequence
 from contextlib import suppress
+from io import BytesIO, FileIO
 from pathlib import Path
 from typing import TypeAlias
 
@@ -42,12 +42,14 @@ class McapFile:
         self.path = path
         self.digests: set[str] = set()
         """Digests of the maps in this file."""
+        self._broken = False
+        """Flag for a write that failed: the index would list what is not there."""
         self._chunks = 0
         self._channels: dict[str, int] = {}
         self._pending = _Pending()
         self._writer = Writer(self._pending, chunk_size=_NEVER, compression=CompressionType.ZSTD)
         self._writer.start(library=library)
-        self._file = io.FileIO(path, "xb", opener=_open_privately)
+        self._file = FileIO(path, "xb", opener=_open_privately)
         try:
             self._commit()
         except OSError:
@@ -84,14 +86,15 @@ class McapFile:
         self._commit()
 
     def finish(self) -> None:
-        """Write the index and close the file.
+        """Write the index and close the file; after an error of ``write`` close it as it is.
 
         Raises:
             OSError: the index cannot be written; the file is closed without it.
         """
         try:
-            self._writer.finish()
-            self._commit()
+            if not self._broken:
+                self._writer.finish()
+                self._commit()
         finally:
             self.close()
 
@@ -115,6 +118,7 @@ class McapFile:
             while data:
                 data = data[self._file.write(data) :]
         except OSError:
+            self._broken = True
             with suppress(OSError):
                 os.ftruncate(self._file.fileno(), end)
             raise
@@ -130,7 +134,7 @@ def _chunk_bytes(messages: Sequence[TopicMessage]) -> int:
     return _INDEX_BYTES + sum(message.ByteSize() + _RECORD_BYTES for _, message in messages)
 
 
-class _Pending(io.BytesIO):
+class _Pending(BytesIO):
     """Bytes of a file that are not yet written."""
 
     def __init__(self) -> None:

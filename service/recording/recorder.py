@@ -4,6 +4,7 @@ import random
 import threading
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from queue import Empty, SimpleQueue
 
 import structlog
@@ -140,7 +141,8 @@ class Recorder:
             self._check_lasting()
 
     def _pause(self, error: OSError) -> None:
-        self._folder.abandon()
+        with suppress(OSError):
+            self._folder.finish()
         self._paused = True
         self._resumed = None
         self._metrics.recording.set(0)

@@ -1,8 +1,11 @@
 """A disk without room."""
 
+import errno
+import os
 import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import FileIO
 
 
 @contextmanager
@@ -14,3 +17,11 @@ def files_up_to(size: int) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+class FullFile(FileIO):
+    """A file on a full disk."""
+
+    def write(self, data: object) -> int:
+        """Fail as the disk does."""
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

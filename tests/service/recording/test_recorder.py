@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
 from structlog.testing import capture_logs
 
 from cab_forecast.recordings import read_recording
@@ -141,6 +142,21 @@ def test_some_of_the_disk_is_left_free(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
     [entry] = [entry for entry in logs if entry["log_level"] == "warning"]
     assert entry["error"] == "No space left on device"
+
+
+def test_a_file_is_ended_while_there_is_room_for_its_index(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = folder_at(tmp_path)
+    with recording(folder) as running:
+        running.record(answered())
+        wait(lambda: running.count("written") == 1)
+        monkeypatch.setattr(folder, "_reserve_bytes", 2**62)
+        running.record(answered())
+        wait(lambda: running.count("disk_full") == 1)
+        [file] = tmp_path.iterdir()
+        with file.open("rb") as stream:
+            assert make_reader(stream).get_summary() is not None
 
 
 def test_a_fault_of_the_recorder_costs_its_call_alone(
