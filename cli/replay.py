@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cab_forecast.endpoints import DEFAULT_ENDPOINT
-from cli.connection import Connection, Endpoint, Timeout, Token, connect
+from cli.connection import Connection, Timeout, connect, with_connection
 from cli.failures import fail
 
 if TYPE_CHECKING:
@@ -25,7 +24,7 @@ _MAX_OTHERS = 3
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
-    app.command("replay")(replay)
+    app.command("replay")(with_connection(replay))
 
 
 def replay(
@@ -33,8 +32,7 @@ def replay(
         Path, typer.Argument(metavar="FILE", help="An .mcap file that a server with FORECAST_RECORD wrote.")
     ],
     *,
-    endpoint: Endpoint = DEFAULT_ENDPOINT,
-    token: Token = None,
+    connection: Connection,
     timeout: Timeout = _TIMEOUT,
     model: Annotated[
         str | None,
@@ -60,7 +58,7 @@ def replay(
     except ModuleNotFoundError as error:
         fail(str(error))
     summary = _Summary(tolerance)
-    with connect(Connection(endpoint, token, timeout)) as client:
+    with connect(connection, timeout) as client:
         for replayed in replayed_calls(client, islice(read_recording(recording), limit), model):
             summary.add(replayed)
             if as_json:
