@@ -181,8 +181,8 @@ class Pipeline:
         if self.shadow is not None:
             call.when_sent = functools.partial(self.shadow.offer, message, plan, catalog)
         if self.recorder is not None:
-            raster = None if plan.scene is None else plan.scene.raster
-            self.recorder.record(message, response, raster, {} if recalled is None else recalled.histories)
+            shown = raster if plan.scene is None else plan.scene.raster
+            self.recorder.record(message, response, shown, {} if recalled is None else recalled.histories)
         return response
 
     async def _recall(

@@ -4,8 +4,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from cab.forecast.v1 import recording_pb2 as recording
+from cab.forecast.v1.digest import raster_digest
 from model.scenes.scene import Raster
 from service.tracking.store.records import split_observations
 
@@ -33,18 +36,38 @@ class AnsweredCall:
         return self.request.ByteSize() + self.response.ByteSize() + raster + histories
 
 
-def recorded_call(call: AnsweredCall, map_digest: str, server_version: str) -> recording.RecordedCall:
+def map_digest(request: pb.PredictRequest) -> str:
+    """Return the digest of a request's scene raster, hexadecimal; empty if it has none."""
+    if not request.HasField("scene_raster"):
+        return ""
+    return (request.scene_raster.digest or raster_digest(request.scene_raster)).hex()
+
+
+def recorded_map(call: AnsweredCall, digest: str) -> recording.RecordedMap:
+    """Return the message of a call's map; one that the request names by its digest alone is in it, too."""
+    message = recording.RecordedMap(digest=digest, scene_raster=call.request.scene_raster)
+    raster = message.scene_raster
+    raster.ClearField("digest")
+    if not raster.HasField("image") and call.raster is not None:
+        _, raster.rows, raster.columns = call.raster.layers.shape
+        raster.origin_x, raster.origin_y = call.raster.origin.tolist()
+        raster.pixels_per_meter = call.raster.pixels_per_meter
+        raster.image.packed_bits = np.packbits(call.raster.layers).tobytes()
+    return message
+
+
+def recorded_call(call: AnsweredCall, digest: str, server_version: str) -> recording.RecordedCall:
     """Return the message of a call.
 
     Args:
         call: the call.
-        map_digest: the digest of its scene raster; empty if there is none.
+        digest: the digest of its scene raster; empty if there is none.
         server_version: the version of the server.
     """
     message = recording.RecordedCall(
         request=call.request,
         response=call.response,
-        map_digest=map_digest,
+        map_digest=digest,
         recalled=[
             recording.RecalledHistory(agent_id=agent_id, states=recalled_states(history))
             for agent_id, history in call.histories.items()
@@ -52,7 +75,7 @@ def recorded_call(call: AnsweredCall, map_digest: str, server_version: str) -> r
         ],
         server_version=server_version,
     )
-    if map_digest:
+    if digest:
         message.request.scene_raster.ClearField("image")
     return message
 

@@ -1,16 +1,13 @@
 """The folder of a recording: which files it holds, and what is written of a call."""
 
 import errno
-import hashlib
 import os
 import shutil
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
-from cab.forecast.v1 import prediction_service_pb2 as pb
-from cab.forecast.v1 import recording_pb2 as recording
-from service.recording.call import AnsweredCall, recorded_call
+from service.recording.call import AnsweredCall, map_digest, recorded_call, recorded_map
 from service.recording.frames import agents_frame, timestamp
 from service.recording.map_grid import map_grid
 from service.recording.mcap_file import McapFile, TopicMessage
@@ -21,7 +18,6 @@ CALLS, MAPS = "/forecast/call", "/forecast/map"
 SCENE, GRID, FRAMES = "/forecast/scene", "/forecast/grid", "/tf"
 """Topics of Foxglove's messages."""
 _PREFIX, _SUFFIX = "forecast-", ".mcap"
-_DIGEST_BYTES = 16
 
 
 class TooLargeCallError(Exception):
@@ -58,7 +54,7 @@ class RecordingFolder:
             TooLargeCallError: it is larger than a file may be.
         """
         self.check_room()
-        digest = _digest(call.request)
+        digest = map_digest(call.request)
         file = self._file
         messages = list(self._messages(call, digest, file))
         if file is None or not file.has_room(messages, self._file_bytes):
@@ -108,7 +104,7 @@ class RecordingFolder:
             file: the file that will hold them; None: a new one.
         """
         if digest and (file is None or digest not in file.digests):
-            yield MAPS, recording.RecordedMap(digest=digest, scene_raster=call.request.scene_raster)
+            yield MAPS, recorded_map(call, digest)
         if call.raster is not None and (file is None or digest != self._grid):
             yield GRID, map_grid(call.raster, timestamp(call))
         yield CALLS, recorded_call(call, digest, self._version)
@@ -127,11 +123,3 @@ class RecordingFolder:
             path.unlink(missing_ok=True)
         name = f"{_PREFIX}{datetime.now(UTC):%Y%m%dT%H%M%S.%f}Z-{os.getpid()}{_SUFFIX}"
         return McapFile(self._path / name, f"cab-forecast {self._version}")
-
-
-def _digest(request: pb.PredictRequest) -> str:
-    """Return the digest of a request's scene raster; empty if it has none."""
-    if not request.HasField("scene_raster"):
-        return ""
-    raster = request.scene_raster.SerializeToString(deterministic=True)
-    return hashlib.blake2b(raster, digest_size=_DIGEST_BYTES).hexdigest()

@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
+from cab.forecast.v1 import prediction_service_pb2 as pb
+from cab.forecast.v1.digest import raster_digest
 from cab_forecast.recordings import read_recording
 from service.recording.folder import CALLS, GRID, MAPS, RecordingFolder, TooLargeCallError
 from tests.service.recording.calls import VERSION, answered, folder_at, raster
@@ -71,6 +73,21 @@ def test_a_map_is_in_a_file_once(tmp_path: Path) -> None:
     assert topics(second)[MAPS] == topics(second)[GRID] == 1
     images = [call.request.scene_raster for file in (first, second) for call in read_recording(file)]
     assert images == [answered(road=road).request.scene_raster for road in (one, one, other, one, one)]
+
+
+def test_a_map_that_a_call_names_by_its_digest_is_recorded(tmp_path: Path) -> None:
+    folder = folder_at(tmp_path)
+    road = raster(3, side=41)
+    sent = answered(road=road)
+    named = answered(road=road)
+    named.request.scene_raster.CopyFrom(pb.SceneRaster(digest=raster_digest(sent.request.scene_raster)))
+    folder.write(named)  # its image came before the recording began
+    folder.write(sent)
+    folder.finish()
+    [file] = files(tmp_path)
+    assert topics(file)[MAPS] == 1
+    for call in read_recording(file):
+        assert call.request.scene_raster == sent.request.scene_raster
 
 
 def test_a_call_beyond_the_size_of_a_file_is_refused_and_the_next_one_is_not(tmp_path: Path) -> None:

@@ -108,9 +108,11 @@ class RecordedMap(_message.Message):
     DIGEST_FIELD_NUMBER: _builtins.int
     SCENE_RASTER_FIELD_NUMBER: _builtins.int
     digest: _builtins.str
-    """Digest of the raster (BLAKE2b, hexadecimal)."""
+    """SceneRaster.digest of the raster, hexadecimal."""
     @_builtins.property
-    def scene_raster(self) -> _prediction_service_pb2.SceneRaster: ...
+    def scene_raster(self) -> _prediction_service_pb2.SceneRaster:
+        """The raster with its image, also where the call named it by its digest alone."""
+
     def __init__(
         self,
         *,
