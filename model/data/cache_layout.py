@@ -13,7 +13,7 @@ from model.features.neighbor_boxes import BOX_NUMBERS, BOXES
 from model.features.spec import Frame
 from model.features.standardization import STATE_SIZE
 from model.forecaster import Protocol
-from model.networks.config import AnyNetworkConfig, CoverNetConfig, NetworkConfig
+from model.networks.config import AnyNetworkConfig, NetworkConfig
 from model.scenes.raster import PATCH_SIZE
 from model.scenes.scene import AgentType
 
@@ -149,7 +149,7 @@ def in_agent_frame(config: AnyNetworkConfig) -> bool:
 
 def draws(config: AnyNetworkConfig) -> bool:
     """Return whether a network sees its neighbours as boxes in a picture."""
-    return isinstance(config, CoverNetConfig) and bool(config.neighbor_types)
+    return config.features.neighbor_boxes and bool(config.neighbor_types)
 
 
 def neighbors_name(kind: AgentType) -> str:

@@ -63,7 +63,7 @@ def model_card(
 - **Training**: epoch {progress.best_epoch} of {progress.epoch} (settings ask for {config.epochs}),
   batches of {config.batch_size}, learning rate {config.learning_rate:g}, seed {config.seed};
   {progress.seconds / 60:.0f} minutes on {origin.machine}.
-- **Calibration**: {_calibration(calibration, origin)}.
+- **Calibration**: {_calibration(calibration, origin, config.in_agent_frame)}.
 - **Command**: `{origin.command}`, with the settings below as SETTINGS.toml.
 - **Licence**: {LICENSE}.
 
@@ -116,7 +116,7 @@ RAN_AWAY = "a number ran to the bound of its search: the likelihood asks for mor
 """Warning about such a calibration, on the card and while training."""
 
 
-def _calibration(calibration: AnyCalibration | None, origin: Origin) -> str:
+def _calibration(calibration: AnyCalibration | None, origin: Origin, held_out: bool) -> str:
     if calibration is None:
         return "none, the forecasts are as sure of themselves as the method has them"
     if isinstance(calibration, HorizonCalibration):
@@ -128,10 +128,11 @@ def _calibration(calibration: AnyCalibration | None, origin: Origin) -> str:
             f"{f'; {RAN_AWAY}' if calibration.ran_away else ''}"
         )
     blind = calibration.blind_width
+    positions = f"positions of {origin.chosen_on}" if held_out else "training positions"
     of_blind = "" if blind is None else f" (of blind forecasts {blind:.3f})"
     return (
         f"standard deviations times {calibration.width:.3f}{of_blind}, logits of the modes divided by "
-        f"{calibration.temperature:.3f}, fitted after training, so that training positions are the "
+        f"{calibration.temperature:.3f}, fitted after training, so that {positions} are the "
         "likeliest. Means and the order of the modes are the network's own; their probabilities are nearer "
         "to each other than it had learned them where the divisor is above 1"
         f"{f'; {RAN_AWAY}' if calibration.ran_away else ''}"

@@ -193,7 +193,8 @@ class Run:
                 calibration = fit_by_horizon(vehicles, validation.pairs)
                 calibrate_by_horizon(vehicles, calibration)
             else:
-                calibration = fit_calibration(vehicles, train)
+                pairs = validation.pairs if config.in_agent_frame else train
+                calibration = fit_calibration(vehicles, pairs)
                 calibrate(vehicles, calibration)
             if calibration.ran_away:
                 on_message(f"calibration: {RAN_AWAY}")
