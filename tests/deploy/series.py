@@ -42,6 +42,13 @@ async def exported() -> dict[str, Labels]:
         _add(found, server)
     async with running(FakeForecaster(_MODEL), store=_NOWHERE, **_PATIENT) as server:
         await call_grpc(server, tracks.request(1, _MODEL))
+        server.metrics.shadow_calls.labels(
+            _MODEL, "done"
+        )  # these servers have neither a shadow model nor keys
+        keys = KeyMetrics(server.metrics.registry)
+        keys.requests.labels("planner", "OK")
+        keys.agents.labels("planner")
+        keys.refused.labels("planner", "rate")
         _add(found, server)
     found["forecast_track_store_errors_total"]["reason"].update(FailureReason)
     kinds = [kind for kind in vars(errors).values() if isinstance(kind, type)]
