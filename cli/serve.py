@@ -26,13 +26,14 @@ class _ServeCommand(TyperCommand):
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Print the help, then the settings."""
         from rich.console import Console  # noqa: PLC0415
-        from rich.table import Table  # noqa: PLC0415
+        from rich.table import Column, Table  # noqa: PLC0415
         from rich.text import Text  # noqa: PLC0415
 
         from service.settings_reference import settings_reference  # noqa: PLC0415 (slow to import)
 
         super().format_help(ctx, formatter)
-        settings = Table("Variable", "Default", "Meaning", title="All settings", box=None, pad_edge=False)
+        variable = Column("Variable", no_wrap=True)
+        settings = Table(variable, "Default", "Meaning", title="All settings", box=None, pad_edge=False)
         for setting in settings_reference():
             allowed = f" Allowed: {setting.allowed}." if setting.allowed else ""
             meaning = setting.meaning.replace("``", "") + allowed

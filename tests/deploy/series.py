@@ -42,10 +42,9 @@ async def exported() -> dict[str, Labels]:
         _add(found, server)
     async with running(FakeForecaster(_MODEL), store=_NOWHERE, **_PATIENT) as server:
         await call_grpc(server, tracks.request(1, _MODEL))
-        server.metrics.shadow_calls.labels(
-            _MODEL, "done"
-        )  # these servers have neither a shadow model nor keys
-        keys = KeyMetrics(server.metrics.registry)
+        # These servers have neither a shadow model nor keys
+        server.metrics.shadow_calls.labels(_MODEL, "done")
+        keys = server.metrics.keys
         keys.requests.labels("planner", "OK")
         keys.agents.labels("planner")
         keys.refused.labels("planner", "rate")
