@@ -33,6 +33,7 @@ class ForecastError(Exception):
         reason: machine-readable cause from the server, e.g. ``BAD_FIELD``; may be empty.
         field_violations: the fields that were refused.
         retry_after: seconds to wait before a retry; None: the server did not say.
+        request_id: id by which the server's log names the call; empty: the server did not say.
     """
 
     default_code: ClassVar[str] = "UNKNOWN"
@@ -47,6 +48,7 @@ class ForecastError(Exception):
         reason: str = "",
         field_violations: Sequence[FieldViolation] = (),
         retry_after: float | None = None,
+        request_id: str = "",
     ) -> None:
         super().__init__(message)
         self.message = message
@@ -54,6 +56,7 @@ class ForecastError(Exception):
         self.reason = reason
         self.field_violations = tuple(field_violations)
         self.retry_after = retry_after
+        self.request_id = request_id
 
     def __str__(self) -> str:
         """Return the message, then each refused field that it does not name."""
@@ -187,6 +190,7 @@ def error_for(
     reason: str = "",
     field_violations: Sequence[FieldViolation] = (),
     retry_after: float | None = None,
+    request_id: str = "",
 ) -> ForecastError:
     """Return the exception for a status; codes outside the contract become a plain ``ForecastError``.
 
@@ -196,6 +200,14 @@ def error_for(
         reason: reason from the server's ErrorInfo.
         field_violations: fields that the server refused.
         retry_after: seconds; None: the server did not say.
+        request_id: id of the request; empty: the server did not say.
     """
     kind = _BY_REASON.get((code, reason)) or _BY_CODE.get(code, ForecastError)
-    return kind(message, code=code, reason=reason, field_violations=field_violations, retry_after=retry_after)
+    return kind(
+        message,
+        code=code,
+        reason=reason,
+        field_violations=field_violations,
+        retry_after=retry_after,
+        request_id=request_id,
+    )

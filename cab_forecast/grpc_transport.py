@@ -8,7 +8,7 @@ from typing import Any
 import grpc
 from google.protobuf import any_pb2
 from google.protobuf.message import Message
-from google.rpc.error_details_pb2 import BadRequest, ErrorInfo, RetryInfo
+from google.rpc.error_details_pb2 import BadRequest, ErrorInfo, RequestInfo, RetryInfo
 from grpc import aio
 from grpc.aio import EOF  # type: ignore[attr-defined]  # the stubs lack it
 from grpc_status import rpc_status
@@ -179,7 +179,7 @@ def error_from_call(call: grpc.RpcError, connection: Connection) -> ForecastErro
     code, message = call.code().name, call.details() or ""
     reason, retry_after = "", None
     violations: list[FieldViolation] = []
-    info, bad, retry = ErrorInfo(), BadRequest(), RetryInfo()
+    info, bad, retry, request = ErrorInfo(), BadRequest(), RetryInfo(), RequestInfo()
     details = _details(call)
     for detail in details:
         if detail.Unpack(info):
@@ -188,6 +188,8 @@ def error_from_call(call: grpc.RpcError, connection: Connection) -> ForecastErro
             violations += [FieldViolation(v.field, v.description) for v in bad.field_violations]
         elif detail.Unpack(retry):
             retry_after = retry.retry_delay.ToNanoseconds() / 1e9
+        else:
+            detail.Unpack(request)
     if not details and code == "UNAVAILABLE":
         # The server's own UNAVAILABLE has details; this one comes from the channel.
         broken_off = _BROKEN_OFF in message
@@ -200,7 +202,12 @@ def error_from_call(call: grpc.RpcError, connection: Connection) -> ForecastErro
         # gRPC's own size limit refused the message before the server's code could.
         reason = TOO_LARGE
     return error_for(
-        code, message or code, reason=reason, field_violations=violations, retry_after=retry_after
+        code,
+        message or code,
+        reason=reason,
+        field_violations=violations,
+        retry_after=retry_after,
+        request_id=request.request_id,
     )
 
 

@@ -259,6 +259,7 @@ def error_from_problem(
             if isinstance(entry, dict)
         ],
         retry_after=retry_after,
+        request_id=str(problem.get("request_id") or ""),
     )
 
 

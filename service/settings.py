@@ -170,6 +170,9 @@ class Settings(BaseSettings):
     """Least severe level that is logged."""
     log_json: bool = False
     """Logs as JSON lines."""
+    access_log: float = Field(default=0.0, ge=0, le=1)
+    """Share of the calls, 0 to 1, that have a line in the log at ``info``; at ``debug`` all have one. The
+    request id decides which, so that all servers log the same ones."""
 
     @field_validator("http", "grpc", "probes")
     @classmethod

@@ -20,6 +20,7 @@ from service.access.caller import Grant
 from service.errors import DeadlineExceeded, Overloaded
 from service.predict.scheduler import CostModel, Order
 from service.telemetry.metrics import Metrics
+from service.telemetry.request_ids import current_request_id
 
 _MIN_RETRY = 0.05
 _MAX_RETRY = 10.0
@@ -73,6 +74,8 @@ class Call:
         """Time on the event loop's clock when the size was known."""
         self.places = 0
         """Number of queue places held."""
+        self.request_id = current_request_id()
+        """Id of the request, for logs; empty: there is none."""
         self.caller: str | None = None
         """Name of the caller's key; None: there is none."""
         self.grant: Grant | None = None

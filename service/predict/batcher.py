@@ -278,7 +278,10 @@ class Batcher:
             raise
         except Exception:
             _log.exception(
-                "forward failed", model=job.forecaster.info.name, agents=sum(e.agents for e in batch)
+                "forward failed",
+                model=job.forecaster.info.name,
+                agents=sum(entry.agents for entry in batch),
+                request_ids=sorted({entry.call.request_id for entry in batch}),
             )
             self._fail(batch, Internal())
             return

@@ -1,7 +1,9 @@
 """Parts of a call that both transports share: accounting, error mapping, and the methods to execute."""
 
+import zlib
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager
+from time import perf_counter
 from typing import Any, TypeVar
 
 import structlog
@@ -20,7 +22,9 @@ from cab.forecast.v1.routes import (
 from service.access.caller import Caller
 from service.errors import BadField, Internal, ServiceError
 from service.predict.dataplane import DataPlane
+from service.settings import Settings
 from service.telemetry.metrics import Call, Metrics
+from service.telemetry.request_ids import current_request_id
 
 _log = structlog.get_logger(__name__)
 _Message = TypeVar("_Message", bound=Message)
@@ -39,12 +43,15 @@ UNARY_METHODS: Mapping[Route[Any, Any], Callable[[DataPlane, Any], Awaitable[Mes
 
 
 class CallRecorder:
-    """Recorder of how one call ended, for the metrics and the debug log."""
+    """Recorder of how one call ended."""
 
-    def __init__(self, transport: str, method: str, call: Call) -> None:
+    def __init__(self, transport: str, method: str, call: Call, logged_share: float) -> None:
         self._transport = transport
         self._method = method
         self._call = call
+        self._share = logged_share
+        self._started = perf_counter()
+        self._ended = False
 
     def identified(self, caller: Caller) -> None:
         """Record whose call it is."""
@@ -53,37 +60,70 @@ class CallRecorder:
     def succeeded(self) -> None:
         """Record a call that was answered."""
         self._call.code = "OK"
-        self._debug()
+        self._log()
 
     def failed(self, exception: Exception) -> ServiceError:
         """Record a failed call; return the error to respond with."""
         error = to_service_error(exception, self._method)
         self._call.code = error.code
-        self._debug(reason=error.reason)
+        self._log(reason=error.reason)
         return error
 
-    def cancelled(self) -> None:
-        """Record that the client disconnected first; the code is CANCELLED already."""
-        self._debug()
+    def end(self) -> None:
+        """Record that the client disconnected first, unless the call has succeeded or failed."""
+        if not self._ended:
+            self._log()
 
-    def _debug(self, **fields: str) -> None:
-        _log.debug("call", transport=self._transport, method=self._method, code=self._call.code, **fields)
+    def _log(self, **fields: str) -> None:
+        # Written before the error is sent: after that, a line would keep the call in progress
+        self._ended = True
+        if self._call.key:
+            fields["key"] = self._call.key
+        log = _log.info if _is_sampled(current_request_id(), self._share) else _log.debug
+        seconds = round(perf_counter() - self._started, 6)
+        log(
+            "call",
+            transport=self._transport,
+            method=self._method,
+            code=self._call.code,
+            seconds=seconds,
+            **fields,
+        )
 
 
-@contextmanager
-def record_call(
-    metrics: Metrics, transport: str, method: str, *, timed: bool = True
-) -> Iterator[CallRecorder]:
-    """Count and time a call.
+class CallRecords:
+    """Records of all calls of one transport: counts, durations and the access log."""
 
-    Args:
-        metrics: receives the count and the duration.
-        transport: "grpc" or "rest".
-        method: name of the contract's method.
-        timed: False for streams, whose duration is up to the client.
-    """
-    with metrics.call(transport, method, timed) as call:
-        yield CallRecorder(transport, method, call)
+    def __init__(self, transport: str, metrics: Metrics, settings: Settings) -> None:
+        """
+        Args:
+            transport: "grpc" or "rest".
+            metrics: receives counts and durations.
+            settings: say which share of the calls is logged.
+        """
+        self._transport = transport
+        self._metrics = metrics
+        self._share = settings.access_log
+
+    @contextmanager
+    def record(self, method: str, *, timed: bool = True) -> Iterator[CallRecorder]:
+        """Count, time and log a call; it counts as cancelled by the client unless the recorder is told more.
+
+        Args:
+            method: name of the contract's method.
+            timed: False for streams, whose duration is up to the client.
+        """
+        with self._metrics.call(self._transport, method, timed) as call:
+            recorder = CallRecorder(self._transport, method, call, self._share)
+            try:
+                yield recorder
+            finally:
+                recorder.end()
+
+
+def _is_sampled(request_id: str, share: float) -> bool:
+    """Return whether a call is logged at info; this is the same on all servers, and when it is retried."""
+    return zlib.crc32(request_id.encode()) < share * 2**32
 
 
 def to_service_error(error: Exception, method: str) -> ServiceError:

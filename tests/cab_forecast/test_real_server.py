@@ -53,6 +53,12 @@ def arguments(request: pytest.FixtureRequest, server: Server) -> dict[str, Any]:
     return {"endpoint": f"http://{server.http_address}", "token": TOKEN, "encoding": encoding}
 
 
+def test_errors_name_the_request(arguments: dict[str, Any]) -> None:
+    with Client(**arguments) as client, pytest.raises(NotFound) as caught:
+        client.get_model("nobody")
+    assert len(caught.value.request_id) == 32
+
+
 def test_forecasts_the_demo(arguments: dict[str, Any]) -> None:
     request = demo_request()
     with Client(**arguments) as client:

@@ -12,7 +12,7 @@ from service.access.caller import Caller
 from service.access.gate import Gate
 from service.access.scopes import Scope, scope_of
 from service.errors import ServiceError
-from service.telemetry.metrics import Metrics
+from service.transports.calls import CallRecords
 from service.transports.grpc.status import abort
 
 CONTRACT = "/cab."
@@ -33,9 +33,9 @@ def current_caller() -> Caller:
 class GateInterceptor(aio.ServerInterceptor):  # type: ignore[type-arg]  # generic in the stubs only
     """Interceptor that refuses calls without a valid key, or with one that lacks the scope."""
 
-    def __init__(self, gate: Gate, metrics: Metrics) -> None:
+    def __init__(self, gate: Gate, records: CallRecords) -> None:
         self._gate = gate
-        self._metrics = metrics
+        self._records = records
 
     async def intercept_service(
         self,
@@ -48,26 +48,30 @@ class GateInterceptor(aio.ServerInterceptor):  # type: ignore[type-arg]  # gener
             return await continuation(handler_call_details)
         metadata = dict(handler_call_details.invocation_metadata)
         header = metadata.get("authorization")
-        key = None
+        caller = None
         try:
             caller = self._gate.identify(header if isinstance(header, str) else None)
-            key = caller.name
             caller.require(_scope(method))
         except ServiceError as error:
             handler = await continuation(handler_call_details)
-            return handler if handler is None else self._refusal(handler, error, method, key)
+            return handler if handler is None else self._refusal(handler, error, method, caller)
         _CALLER.set(caller)  # gRPC runs interceptors and handler of a call in one task
         return await continuation(handler_call_details)
 
     def _refusal(
-        self, handler: "grpc.RpcMethodHandler[Any, Any]", error: ServiceError, method: str, key: str | None
+        self,
+        handler: "grpc.RpcMethodHandler[Any, Any]",
+        error: ServiceError,
+        method: str,
+        caller: Caller | None,
     ) -> "grpc.RpcMethodHandler[Any, Any]":
         name = method.rpartition("/")[2] if method.startswith(CONTRACT) else "other"
 
         async def refuse(_: object, context: Any) -> None:
-            with self._metrics.call("grpc", name) as call:
-                call.code, call.key = error.code, key
-                await abort(context, error)
+            with self._records.record(name) as recorder:
+                if caller is not None:
+                    recorder.identified(caller)
+                await abort(context, recorder.failed(error))
 
         # The refusal must have the arity of the method that it replaces: some of them stream.
         if handler.request_streaming:

@@ -25,8 +25,8 @@ from service.errors import TooLarge
 from service.predict.dataplane import DataPlane
 from service.predict.request_reader import LARGE_BYTES, EncodedRequest, RequestLimits, read_protobuf
 from service.settings import Settings
-from service.telemetry.metrics import Metrics
-from service.transports.calls import UNARY_METHODS, parse_message, record_call
+from service.telemetry.request_ids import HEADER, current_request_id
+from service.transports.calls import UNARY_METHODS, CallRecords, parse_message
 from service.transports.grpc.gate import current_caller
 from service.transports.grpc.intake import Incoming
 from service.transports.grpc.status import abort
@@ -38,9 +38,9 @@ Context = Any  # grpc.aio.ServicerContext is generic in the message types, which
 class Handlers:
     """The contract's methods as gRPC handlers."""
 
-    def __init__(self, dataplane: DataPlane, metrics: Metrics, settings: Settings) -> None:
+    def __init__(self, dataplane: DataPlane, records: CallRecords, settings: Settings) -> None:
         self._dataplane = dataplane
-        self._metrics = metrics
+        self._records = records
         self._max_bytes = settings.max_request_bytes
         self._read_request = functools.partial(read_protobuf, limits=RequestLimits.from_settings(settings))
 
@@ -115,7 +115,8 @@ class Handlers:
     @asynccontextmanager
     async def _recorded(self, route: Route[Any, Any], context: Context) -> AsyncIterator[None]:
         """Record a call, and turn exceptions into a status with details."""
-        with record_call(self._metrics, "grpc", route.method, timed=not route.streaming) as recorder:
+        context.set_trailing_metadata(((HEADER, current_request_id()),))
+        with self._records.record(route.method, timed=not route.streaming) as recorder:
             recorder.identified(current_caller())
             try:
                 yield

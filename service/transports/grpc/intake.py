@@ -18,7 +18,7 @@ from grpc import aio
 from service.access.caller import Caller, Grant
 from service.errors import BadField, RequestTimeout, ServiceError
 from service.settings import Settings
-from service.telemetry.metrics import Metrics
+from service.transports.calls import CallRecords
 from service.transports.grpc.gate import CONTRACT
 from service.transports.grpc.status import abort
 from service.transports.intake import Intake
@@ -117,9 +117,9 @@ class Incoming:
 class IntakeInterceptor(aio.ServerInterceptor):  # type: ignore[type-arg]  # generic in the stubs only
     """Interceptor that lets handlers accept a call before its request is read."""
 
-    def __init__(self, intake: Intake, metrics: Metrics, settings: Settings) -> None:
+    def __init__(self, intake: Intake, records: CallRecords, settings: Settings) -> None:
         self._intake = intake
-        self._metrics = metrics
+        self._records = records
         self._settings = settings
 
     async def intercept_service(
@@ -155,7 +155,6 @@ class IntakeInterceptor(aio.ServerInterceptor):  # type: ignore[type-arg]  # gen
         try:
             return await incoming.read()
         except ServiceError as error:
-            with self._metrics.call("grpc", "other") as call:
-                call.code = error.code
-                await abort(context, error)
+            with self._records.record("other") as recorder:
+                await abort(context, recorder.failed(error))
             raise  # unreachable: abort raises

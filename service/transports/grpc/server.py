@@ -13,10 +13,12 @@ from service.access.tls import Certificates
 from service.predict.dataplane import DataPlane
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
+from service.transports.calls import CallRecords
 from service.transports.grpc.gate import GateInterceptor
 from service.transports.grpc.handlers import Handlers
 from service.transports.grpc.health import HEALTH_SERVICE, Health
 from service.transports.grpc.intake import RECEIVE_MARGIN, IntakeInterceptor
+from service.transports.grpc.request_ids import RequestIdInterceptor
 from service.transports.intake import Intake
 
 _UNLIMITED = -1
@@ -37,10 +39,12 @@ class GrpcServer:
     ) -> None:
         self._settings = settings
         self._access = access
+        records = CallRecords("grpc", metrics, settings)
         self._server = aio.server(
             interceptors=[
-                GateInterceptor(access.gate, metrics),
-                IntakeInterceptor(intake, metrics, settings),
+                RequestIdInterceptor(),
+                GateInterceptor(access.gate, records),
+                IntakeInterceptor(intake, records, settings),
             ],
             options=[
                 ("grpc.max_receive_message_length", settings.max_request_bytes * RECEIVE_MARGIN),
@@ -51,7 +55,7 @@ class GrpcServer:
             ],
         )
         self._health = Health(SERVICES)
-        handlers = Handlers(dataplane, metrics, settings)
+        handlers = Handlers(dataplane, records, settings)
         self._server.add_generic_rpc_handlers(tuple(handlers.generic()))
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
         names = (*SERVICES, HEALTH_SERVICE, reflection.SERVICE_NAME)

@@ -9,6 +9,7 @@ from google.protobuf.message import Message
 from google.rpc import error_details_pb2, status_pb2
 
 from service.errors import DOMAIN, Fault, ServiceError
+from service.telemetry.request_ids import HEADER, current_request_id
 
 DETAILS_KEY = "grpc-status-details-bin"
 """Key of the trailing metadata that carries the status."""
@@ -20,9 +21,12 @@ _MAX_TEXT = 200
 
 
 def to_status(error: ServiceError) -> status_pb2.Status:
-    """Return the status of an error: always with ErrorInfo, with BadRequest if fields are wrong, and with
-    RetryInfo if a retry may succeed."""
+    """Return the status of an error: always with ErrorInfo, with RequestInfo in a request, with BadRequest if
+    fields are wrong, and with RetryInfo if a retry may succeed."""
     details = [_info(error.reason)]
+    request_id = current_request_id()
+    if request_id:
+        details.append(_pack(error_details_pb2.RequestInfo(request_id=request_id)))
     if error.faults:
         details.append(_pack(_bad_request(error.faults)))
     if error.retry_after is not None:
@@ -36,7 +40,7 @@ def to_status(error: ServiceError) -> status_pb2.Status:
 async def abort(context: "grpc.aio.ServicerContext[object, object]", error: ServiceError) -> None:
     """End a call with an error. Raises, as ``context.abort`` does."""
     status = to_status(error)
-    metadata = ((DETAILS_KEY, status.SerializeToString()),)
+    metadata = ((DETAILS_KEY, status.SerializeToString()), (HEADER, current_request_id()))
     await context.abort(grpc.StatusCode[error.code], status.message, metadata)
 
 

@@ -20,8 +20,7 @@ from service.errors import RequestTimeout, TooLarge
 from service.predict.dataplane import DataPlane
 from service.predict.request_reader import LARGE_BYTES, EncodedRequest, RequestLimits, read_protobuf
 from service.settings import Settings
-from service.telemetry.metrics import Metrics
-from service.transports.calls import UNARY_METHODS, CallRecorder, parse_message, record_call
+from service.transports.calls import UNARY_METHODS, CallRecorder, CallRecords, parse_message
 from service.transports.intake import Intake
 from service.transports.rest.codec import parse_json, read_query, read_request, to_json
 from service.transports.rest.negotiation import (
@@ -54,13 +53,13 @@ class Endpoints:
     """The contract's methods as Starlette endpoints."""
 
     def __init__(
-        self, dataplane: DataPlane, metrics: Metrics, settings: Settings, intake: Intake, gate: Gate
+        self, dataplane: DataPlane, records: CallRecords, settings: Settings, intake: Intake, gate: Gate
     ) -> None:
         self._intake = intake
         self._gate = gate
         self._body_timeout = settings.body_timeout
         self._dataplane = dataplane
-        self._metrics = metrics
+        self._records = records
         self._max_bytes = settings.max_request_bytes
         self._limits = RequestLimits.from_settings(settings)
 
@@ -78,7 +77,7 @@ class Endpoints:
         """Return an endpoint that authenticates, records the call, and responds to errors with a problem."""
 
         async def endpoint(request: Request) -> Response:
-            with record_call(self._metrics, "rest", route.method) as recorder:
+            with self._records.record(route.method) as recorder:
                 try:
                     caller = self._gate.identify(request.headers.get("authorization"))
                     recorder.identified(caller)
@@ -88,7 +87,6 @@ class Endpoints:
                     exit_stack(request).enter_context(self._intake.call())
                     response = await behavior(request, grant)
                 except ClientDisconnect:
-                    recorder.cancelled()
                     return Response(status_code=_CLIENT_CLOSED_REQUEST)
                 except Exception as exception:
                     return problem_response(recorder.failed(exception))
@@ -133,7 +131,7 @@ class Endpoints:
             message = read_query(WATCH_SCENE.request, request.query_params)
             return self._dataplane.consistency.watch_scene(message)
 
-        return EventStreamResponse(self._metrics, self._gate, WATCH_SCENE, request, events)
+        return EventStreamResponse(self._records, self._gate, WATCH_SCENE, request, events)
 
     async def _read_body(self, request: Request, max_bytes: int) -> bytes:
         """Return the body; refuse one that is too large as soon as that is known.
@@ -175,7 +173,7 @@ class EventStreamResponse(Response):
 
     def __init__(
         self,
-        metrics: Metrics,
+        records: CallRecords,
         gate: Gate,
         route: Route[Any, Any],
         request: Request,
@@ -184,7 +182,7 @@ class EventStreamResponse(Response):
         """Create the response; the call starts when it is served.
 
         Args:
-            metrics: records the call.
+            records: records the call.
             gate: authenticates the caller.
             route: the contract's method.
             request: the HTTP request.
@@ -192,7 +190,7 @@ class EventStreamResponse(Response):
         """
         self.status_code = 200
         self.init_headers(_EVENT_HEADERS)
-        self._metrics = metrics
+        self._records = records
         self._gate = gate
         self._route = route
         self._request = request
@@ -200,12 +198,11 @@ class EventStreamResponse(Response):
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve the request to its end."""
-        with record_call(self._metrics, "rest", self._route.method, timed=False) as recorder:
+        with self._records.record(self._route.method, timed=False) as recorder:
             writer = _BodyWriter(send, self.raw_headers)
             try:
                 problem = await cancel_on_disconnect(receive, self._serve(recorder, writer))
             except ClientDisconnect:
-                recorder.cancelled()
                 return
             if problem is not None:
                 await problem(scope, receive, send)

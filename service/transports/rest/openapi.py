@@ -258,6 +258,10 @@ def _problem_schema() -> Schema:
                 "description": "Machine-readable cause; tells errors with the same code apart.",
             },
             "errors": {"type": "array", "items": fault, "description": "The fields that are wrong."},
+            "request_id": {
+                "type": "string",
+                "description": "Id of the request, as in the header x-request-id.",
+            },
         },
         "required": ["type", "title", "status", "detail", "code", "reason", "errors"],
     }

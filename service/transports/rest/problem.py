@@ -7,12 +7,14 @@ import orjson
 from starlette.responses import Response
 
 from service.errors import ServiceError, Unauthenticated
+from service.telemetry.request_ids import current_request_id
 
 MEDIA_TYPE = "application/problem+json"
 
 
 def to_problem(error: ServiceError) -> dict[str, Any]:
     """Return the problem document of an error."""
+    request_id = current_request_id()
     return {
         "type": error.type_uri(),
         "title": error.title,
@@ -21,6 +23,7 @@ def to_problem(error: ServiceError) -> dict[str, Any]:
         "code": error.code,
         "reason": error.reason,
         "errors": [{"field": fault.field, "detail": fault.detail} for fault in error.faults],
+        **({"request_id": request_id} if request_id else {}),
     }
 
 

@@ -26,7 +26,8 @@ from service.errors import BadField, MethodNotAllowed, NotFound, ServiceError, U
 from service.predict.dataplane import DataPlane
 from service.settings import Settings, split_address
 from service.telemetry.metrics import Metrics
-from service.transports.calls import to_service_error
+from service.telemetry.request_ids import HEADER, TRACEPARENT
+from service.transports.calls import CallRecords, to_service_error
 from service.transports.intake import Intake
 from service.transports.rest.connections import BoundedProtocol, Connections
 from service.transports.rest.endpoints import Endpoints, ExitStackMiddleware
@@ -35,6 +36,7 @@ from service.transports.rest.handshake import Handshake
 from service.transports.rest.negotiation import TIMEOUT_HEADER
 from service.transports.rest.openapi import openapi_document
 from service.transports.rest.problem import problem_response
+from service.transports.rest.request_ids import RequestIdMiddleware
 
 _POLL = 0.005
 """Seconds between looks at uvicorn's started flag."""
@@ -72,10 +74,11 @@ def build_app(
             CORSMiddleware,
             allow_origins=settings.cors_origins,
             allow_methods=["GET", "POST"],
-            allow_headers=["Authorization", TIMEOUT_HEADER],
-            expose_headers=["Retry-After"],
+            allow_headers=["Authorization", TIMEOUT_HEADER, HEADER, TRACEPARENT],
+            expose_headers=["Retry-After", HEADER],
         )
-    for route, endpoint in Endpoints(dataplane, metrics, settings, intake, gate).by_route().items():
+    records = CallRecords("rest", metrics, settings)
+    for route, endpoint in Endpoints(dataplane, records, settings, intake, gate).by_route().items():
         app.add_route(route.path, endpoint, methods=[route.verb])
 
     async def show_metrics(_: Request) -> Response:
@@ -140,7 +143,7 @@ class HttpServer:
         )
         self._server = _Uvicorn(
             uvicorn.Config(
-                app,
+                RequestIdMiddleware(app),
                 log_config=None,
                 access_log=False,
                 lifespan="off",

@@ -16,7 +16,7 @@ from cab.forecast.v1.routes import (
 )
 from service.server import Server
 from service.settings import Settings
-from service.transports.calls import UNARY_METHODS
+from service.transports.calls import UNARY_METHODS, CallRecords
 from service.transports.rest.endpoints import Endpoints
 from service.transports.rest.openapi import openapi_document
 from tests.service.servers import settings
@@ -50,7 +50,11 @@ async def test_server_and_document_have_the_routes() -> None:
     server = Server(settings())
     try:
         endpoints = Endpoints(
-            server.dataplane, server.metrics, server.settings, server.intake, server.access.gate
+            server.dataplane,
+            CallRecords("rest", server.metrics, server.settings),
+            server.settings,
+            server.intake,
+            server.access.gate,
         ).by_route()
     finally:
         await server.stop(drain=False)
