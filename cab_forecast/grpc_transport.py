@@ -15,15 +15,18 @@ from grpc_status import rpc_status
 
 from cab.forecast.v1.routes import Request, Response, Route
 from cab_forecast.connection import Connection
+from cab_forecast.endpoints import Endpoint
 from cab_forecast.errors import TOO_LARGE, FieldViolation, ForecastError, connection_failed, error_for
 from cab_forecast.streams import OpenStream, Stream
 from cab_forecast.timing import Budget
 
-_OPTIONS: Sequence[tuple[str, int]] = (
+_OPTIONS: Sequence[tuple[str, int | str]] = (
     # Responses for hundreds of agents with samples exceed gRPC's default of 4 MiB; the server limits them.
     ("grpc.max_receive_message_length", -1),
     # The client retries by itself, after the time that the server asks for.
     ("grpc.enable_retries", 0),
+    # The addresses of a name are several servers: calls go in turn to each that can be reached.
+    ("grpc.lb_policy_name", "round_robin"),
     # Reconnect to a server that went away as quickly as the client retries.
     ("grpc.initial_reconnect_backoff_ms", 100),
     ("grpc.min_reconnect_backoff_ms", 100),
@@ -46,9 +49,9 @@ class GrpcTransport:
         self._connection = connection
         self._metadata = _metadata(connection)
         self._channel = (
-            grpc.secure_channel(endpoint.target, _credentials(connection), _OPTIONS)
+            grpc.secure_channel(endpoint.target, _credentials(connection), _options(endpoint))
             if endpoint.secure
-            else grpc.insecure_channel(endpoint.target, _OPTIONS)
+            else grpc.insecure_channel(endpoint.target, _options(endpoint))
         )
 
     def call(self, route: Route[Request, Response], request: Request, budget: Budget) -> Response:
@@ -100,9 +103,9 @@ class AsyncGrpcTransport:
         self._connection = connection
         self._metadata = _metadata(connection)
         self._channel = (
-            aio.secure_channel(endpoint.target, _credentials(connection), _OPTIONS)
+            aio.secure_channel(endpoint.target, _credentials(connection), _options(endpoint))
             if endpoint.secure
-            else aio.insecure_channel(endpoint.target, _OPTIONS)
+            else aio.insecure_channel(endpoint.target, _options(endpoint))
         )
 
     async def call(self, route: Route[Request, Response], request: Request, budget: Budget) -> Response:
@@ -221,6 +224,11 @@ def _details(call: grpc.RpcError) -> Sequence[any_pb2.Any]:
 
 def _metadata(connection: Connection) -> tuple[tuple[str, str], ...]:
     return (("authorization", f"Bearer {connection.token}"),) if connection.token else ()
+
+
+def _options(endpoint: Endpoint) -> Sequence[tuple[str, int | str]]:
+    """Return the options of a channel; a proxy in the environment leads to no server on this machine."""
+    return [*_OPTIONS, ("grpc.enable_http_proxy", 0)] if endpoint.is_loopback else _OPTIONS
 
 
 def _credentials(connection: Connection) -> grpc.ChannelCredentials:

@@ -23,7 +23,7 @@ class RestTransport:
 
     def __init__(self, connection: Connection) -> None:
         self._codec = Codec(connection)
-        self._client = httpx.Client(verify=_verify(connection))
+        self._client = httpx.Client(verify=_verify(connection), mounts=_without_proxy(connection))
 
     def call(self, route: Route[Request, Response], request: Request, budget: Budget) -> Response:
         """See ``Transport.call``."""
@@ -74,7 +74,7 @@ class AsyncRestTransport:
 
     def __init__(self, connection: Connection) -> None:
         self._codec = Codec(connection)
-        self._client = httpx.AsyncClient(verify=_verify(connection))
+        self._client = httpx.AsyncClient(verify=_verify(connection), mounts=_without_proxy(connection))
 
     async def call(self, route: Route[Request, Response], request: Request, budget: Budget) -> Response:
         """See ``AsyncTransport.call``."""
@@ -151,6 +151,12 @@ def _shut_down(response: httpx.Response) -> None:
         with suppress(OSError):
             connection.shutdown(socket.SHUT_RDWR)
     response.close()
+
+
+def _without_proxy(connection: Connection) -> dict[str, None]:
+    """Return mounts for httpx: a proxy in the environment leads to no server on this machine."""
+    endpoint = connection.endpoint
+    return {f"all://{endpoint.host}": None} if endpoint.is_loopback else {}
 
 
 def _verify(connection: Connection) -> ssl.SSLContext | bool:

@@ -4,13 +4,11 @@ The checks change nothing: ports are opened and closed, Redis is only asked.
 """
 
 import asyncio
-import os
 import resource
 import socket
 from collections.abc import AsyncIterator, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
-from pathlib import Path
 from time import perf_counter
 from typing import Any
 
@@ -18,6 +16,7 @@ from redis.exceptions import RedisError
 
 from service.access.access import Access
 from service.access.gate import require_protection
+from service.cores import usable_cores
 from service.predict.catalog import build_catalog
 from service.predict.models_folder import load_models, models_folder
 from service.redis_url import Layout, parse_address
@@ -28,7 +27,6 @@ from service.tracking.store.redis.connection import connect
 _REDIS_VERSION = 7
 _PINGS = 20
 _FILES_PER_CALL = 2
-_CGROUP_QUOTA = Path("/sys/fs/cgroup/cpu.max")
 
 
 class Level(StrEnum):
@@ -57,20 +55,6 @@ def examine(settings: Settings) -> Iterator[Finding]:
     yield _threads(settings)
     yield _files(settings)
     yield _protection(settings)
-
-
-def usable_cores(quota: Path = _CGROUP_QUOTA) -> float:
-    """Return the cores that this process may use: by its affinity and by the quota of its control group.
-
-    Args:
-        quota: the file of the quota (cgroup v2).
-    """
-    cores = float(len(os.sched_getaffinity(0)))
-    try:
-        allowed, period = quota.read_text(encoding="ascii").split()
-        return min(cores, int(allowed) / int(period))
-    except (OSError, ValueError):  # no such file, or "max": no quota
-        return cores
 
 
 def _models(settings: Settings) -> Iterator[Finding]:

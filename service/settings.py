@@ -147,10 +147,17 @@ class Settings(BaseSettings):
     write_timeout: float = Field(default=10.0, gt=0)
     """Seconds in which a client must go on reading its response. Then REST closes the connection, and a gRPC
     call stops to count as one in progress."""
+    idle_timeout: float = Field(default=75.0, gt=0)
+    """Seconds for which REST keeps a connection without a request. It should be longer than clients and
+    proxies keep theirs, 60 s for many, or they send requests on connections that are about to be closed."""
+    max_connection_age: float | None = Field(default=300.0, gt=0)
+    """Seconds after which a client is told to open a new connection, so that load balancers can give a new
+    server its share: over gRPC within 10 % of it, over REST with a later response. Calls and streams in
+    progress go on to their end. None: connections may stay open for good."""
     drain_seconds: float = Field(default=10.0, ge=0)
     """Seconds that accepted calls get to finish when the server stops."""
     threads: int | None = Field(default=None, ge=1)
-    """Number of threads of the forward; None: the physical cores."""
+    """Number of threads of the forward; None: the physical cores, at most the cores of the CPU quota."""
     engine: Engine = Engine.ONNXRUNTIME
     """Engine of the forward: ``onnxruntime`` runs networks of the agent's frame as one native call and all
     other models in PyTorch; ``eager`` runs all models in PyTorch."""

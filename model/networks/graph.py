@@ -6,8 +6,12 @@ beside busy neighbours. The graphs ship with the package and hold operations onl
 checkpoint brings.
 """
 
+import os
 from pathlib import Path
 from typing import Final
+
+# ONNX Runtime's official builds report their use to Microsoft unless this is set before they are loaded.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 import onnxruntime
 import torch

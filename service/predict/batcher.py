@@ -6,7 +6,6 @@ alone, under heavy load batches grow by themselves. The most urgent work goes fi
 """
 
 import asyncio
-import os
 import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
@@ -19,6 +18,7 @@ import torch
 from model.forecaster import Context, Forecaster, ModelInfo, Prepared, complete
 from model.mixture import TrajectoryMixture
 from model.scenes.scene import AgentType
+from service.cores import whole_cores
 from service.errors import DeadlineExceeded, Internal, Unavailable
 from service.predict.admission import Admission, Call
 from service.predict.scheduler import DeadlineQueue
@@ -130,7 +130,7 @@ class Batcher:
             1, thread_name_prefix="forward", initializer=set_forward_threads, initargs=(threads,)
         )
         self._cutters = ThreadPoolExecutor(
-            threads or os.cpu_count(), thread_name_prefix="patches", initializer=set_helper_threads
+            threads or whole_cores(), thread_name_prefix="patches", initializer=set_helper_threads
         )
         self._worker: asyncio.Task[None] | None = None
         self._crashed = False

@@ -1,13 +1,13 @@
 """Service without its transports: construction, start and end of everything that a call needs."""
 
 import asyncio
-import os
 from concurrent.futures import ThreadPoolExecutor
 
 import structlog
 
 from cab.forecast.v1 import admin_service_pb2 as admin_pb
 from cab.forecast.v1 import model_service_pb2 as pb
+from service.cores import whole_cores
 from service.errors import BadField, Unavailable
 from service.lifecycle import Lifecycle, Phase
 from service.predict.admission import Admission
@@ -18,7 +18,7 @@ from service.predict.rasters.library import RasterLibrary
 from service.predict.rasters.shared import SharedRasters
 from service.predict.reload import Load, Reloader
 from service.predict.shadow import Shadow
-from service.predict.torch_threads import set_helper_threads
+from service.predict.torch_threads import forward_threads, set_helper_threads
 from service.recording.factory import make_recorder
 from service.settings import Settings, split_shadow
 from service.telemetry.metrics import Metrics
@@ -45,9 +45,11 @@ class DataPlane:
         self._lifecycle = Lifecycle()
         self._references = ModelReferences()
         self._admission = Admission(settings.max_batch_agents, settings.max_queue_agents, metrics)
-        self._batcher = Batcher(settings.max_batch_agents, self._admission, metrics, threads=settings.threads)
+        self._batcher = Batcher(
+            settings.max_batch_agents, self._admission, metrics, threads=forward_threads(settings.threads)
+        )
         self._threads = ThreadPoolExecutor(
-            min(_MAX_WORKERS, (os.cpu_count() or 1) + 1),
+            min(_MAX_WORKERS, whole_cores() + 1),
             thread_name_prefix="calls",
             initializer=set_helper_threads,
         )

@@ -13,6 +13,7 @@ from model.checkpoint import CONFIG_FILE, TENSORS_FILE, load_checkpoint
 from model.forecaster import Forecaster, ModelInfo, Protocol
 from model.registry import DuplicateModelError, Registry, baselines, checkpoint_folders
 from service.predict.canary import check
+from service.predict.torch_threads import forward_threads
 from service.settings import Engine, Settings, SettingsError, bundled_models
 
 _log = structlog.get_logger(__name__)
@@ -181,7 +182,7 @@ def _load(folder: Path, config: str, settings: Settings) -> Source:
         return Source(config, info, weights, None)
     forecaster = checkpoint.forecaster()
     if settings.engine is Engine.ONNXRUNTIME:
-        forecaster.compile(settings.threads)
+        forecaster.compile(forward_threads(settings.threads))
     check(forecaster)
     return Source(config, info, weights, forecaster)
 

@@ -7,6 +7,10 @@ from typing import TypeVar
 
 _T = TypeVar("_T")
 
+HEARTBEAT = 15.0
+"""Seconds without an event after which a heartbeat tells client and proxies that the stream is alive: a
+comment over REST, an empty message over gRPC."""
+
 
 @asynccontextmanager
 async def closing(events: AsyncIterator[_T]) -> AsyncIterator[AsyncIterator[_T]]:

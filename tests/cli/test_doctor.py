@@ -11,7 +11,6 @@ from typer.testing import CliRunner
 
 from cli.main import app
 from loadtest.redis_servers import single
-from service.doctor import usable_cores
 from tests.model.checkpoints import copy_bundled
 from tests.service.certificates import write_certificate
 from tests.service.tracking.store.stores import require_redis
@@ -123,12 +122,3 @@ def test_a_redis_that_answers(monkeypatch: pytest.MonkeyPatch) -> None:
         ((level, text),) = run(0)["store"]
     assert level in {"OK", "WARN"}  # a busy machine may be slow
     assert text.startswith("Redis ")
-
-
-def test_a_quota_bounds_the_cores(tmp_path: Path) -> None:
-    quota = tmp_path / "cpu.max"
-    assert usable_cores(quota) == len(os.sched_getaffinity(0))
-    quota.write_text("max 100000\n")
-    assert usable_cores(quota) == len(os.sched_getaffinity(0))
-    quota.write_text("50000 100000\n")
-    assert usable_cores(quota) == 0.5

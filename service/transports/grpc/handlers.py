@@ -11,7 +11,7 @@ queue that it waits in.
 import asyncio
 import functools
 from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import asynccontextmanager
+from contextlib import aclosing, asynccontextmanager
 from typing import Any
 
 import grpc
@@ -30,7 +30,7 @@ from service.transports.calls import UNARY_METHODS, CallRecords, parse_message
 from service.transports.grpc.gate import current_caller
 from service.transports.grpc.intake import Incoming
 from service.transports.grpc.status import abort
-from service.transports.streams import closing
+from service.transports.streams import HEARTBEAT, with_idle_ticks
 
 Context = Any  # grpc.aio.ServicerContext is generic in the message types, which are bytes here
 
@@ -99,9 +99,10 @@ class Handlers:
         async def handle(incoming: Incoming, context: Context) -> None:
             async with self._recorded(route, context):
                 events = behavior(parse_message(route.request, await self._read(incoming)))
-                async with current_caller().stream(), closing(events):
-                    async for event in events:
-                        await _send(context, event)
+                ticking = with_idle_ticks(events, HEARTBEAT)
+                async with current_caller().stream(), aclosing(ticking):
+                    async for event in ticking:
+                        await _send(context, route.response() if event is None else event)
 
         return _handler(grpc.unary_stream_rpc_method_handler, handle)
 

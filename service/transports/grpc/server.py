@@ -22,12 +22,16 @@ from service.transports.grpc.request_ids import RequestIdInterceptor
 from service.transports.intake import Intake
 
 _UNLIMITED = -1
+MIN_PING_INTERVAL = 5.0
+"""Seconds between pings of a client that are accepted. Clients may ping every 10 s; networks deliver some
+pings late and the next ones on time. After three pings too early gRPC ends the connection."""
 _KEEPALIVE = (
     # Detect within about a minute that a client has vanished; its streams would never end otherwise.
     ("grpc.keepalive_time_ms", 30_000),
     ("grpc.keepalive_timeout_ms", 20_000),
     ("grpc.http2.max_pings_without_data", 0),  # unlimited
-    ("grpc.http2.min_ping_interval_without_data_ms", 10_000),  # for clients that send keepalive pings too
+    # Without it a client without calls in progress may ping every two hours only.
+    ("grpc.keepalive_permit_without_calls", 1),
 )
 
 
@@ -51,7 +55,9 @@ class GrpcServer:
                 ("grpc.server_handshake_timeout_ms", max(round(settings.header_timeout * 1000), 1)),
                 ("grpc.max_send_message_length", _UNLIMITED),
                 ("grpc.so_reuseport", 0),  # otherwise a second server would silently share the port
+                ("grpc.http2.min_ping_interval_without_data_ms", round(MIN_PING_INTERVAL * 1000)),
                 *_KEEPALIVE,
+                *_connection_age(settings.max_connection_age),
             ],
         )
         self._health = Health(SERVICES)
@@ -94,6 +100,11 @@ class GrpcServer:
         """
         self._health.close()
         await self._server.stop(grace)
+
+
+def _connection_age(seconds: float | None) -> list[tuple[str, int]]:
+    """Return the option of the age; calls in progress get as long as they need."""
+    return [] if seconds is None else [("grpc.max_connection_age_ms", max(round(seconds * 1000), 1))]
 
 
 def _credentials(access: Access) -> grpc.ServerCredentials | None:

@@ -32,6 +32,8 @@ class Connections:
     """Seconds from the connection, or the first byte of a later request, to the end of its headers."""
     body_timeout: float
     """Seconds from the end of the headers to the end of the body."""
+    max_age: float | None
+    """Seconds after which a response asks the client to open a new connection; None: never."""
     write_timeout: float
     """Seconds for which a client may leave a full buffer of its response unread."""
     waiting: "dict[BoundedProtocol, None]" = field(default_factory=dict)
@@ -66,12 +68,14 @@ class BoundedProtocol(HttpToolsProtocol):
         self._limits = limits
         self._header_bytes = 0
         self._in_headers = True
+        self._made = 0.0
         self._timer: asyncio.TimerHandle | None = None
         self._writing: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Count the connection, and wait for its headers."""
         super().connection_made(transport)
+        self._made = self.loop.time()
         self._limits.waiting[self] = None
         self._set_timer(self._limits.header_timeout, self._on_header_timeout)
         self._limits.make_room(self.connections)
@@ -115,6 +119,9 @@ class BoundedProtocol(HttpToolsProtocol):
         self._limits.waiting.pop(self, None)
         self._set_timer(self._limits.body_timeout + _LINGER, self._on_body_timeout)
         super().on_headers_complete()
+        max_age = self._limits.max_age
+        if max_age is not None and self.loop.time() - self._made > max_age:
+            self.cycle.keep_alive = False  # uvicorn tells the client
 
     def on_message_complete(self) -> None:
         """Stop waiting: the request has arrived."""

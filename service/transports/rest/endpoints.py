@@ -32,10 +32,8 @@ from service.transports.rest.negotiation import (
     timeout,
 )
 from service.transports.rest.problem import problem_response, to_problem
-from service.transports.streams import with_idle_ticks
+from service.transports.streams import HEARTBEAT, with_idle_ticks
 
-HEARTBEAT = 15.0
-"""Seconds without an event after which a comment tells client and proxies that the stream is alive."""
 _SMALL_BYTES = 2**16
 """Limit of requests that hold no more than an id; they are parsed on the event loop."""
 _CLIENT_CLOSED_REQUEST = 499

@@ -134,7 +134,11 @@ class HttpServer:
         """
         self._configured_address = address
         self._limits = Connections(
-            _max_connections(settings), settings.header_timeout, settings.body_timeout, settings.write_timeout
+            _max_connections(settings),
+            settings.header_timeout,
+            settings.body_timeout,
+            settings.max_connection_age,
+            settings.write_timeout,
         )
         protocol: Any = (
             functools.partial(BoundedProtocol, self._limits)
@@ -150,6 +154,7 @@ class HttpServer:
                 ws="none",
                 http=protocol,
                 server_header=False,
+                timeout_keep_alive=settings.idle_timeout,  # type: ignore[arg-type]  # fractions work
             )
         )
         self._task: asyncio.Task[None] | None = None

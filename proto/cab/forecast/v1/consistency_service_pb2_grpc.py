@@ -131,6 +131,7 @@ class ConsistencyServiceServicer:
     def WatchScene(self, request, context):
         """What is found out about a scene from now on, whichever replica finds it out: at each observation the set
         as it is then, and once more when it settles. The first message is empty: from then on nothing is missed.
+        Over gRPC more empty messages follow while there is nothing to say, every 15 s, so that proxies keep the stream open.
         Ends with the call's deadline, or when the server drains. A reader that is too slow misses the oldest; `missed` says how many.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)

@@ -62,6 +62,7 @@ class ConsistencyServiceStub:
     WatchScene: _grpc.UnaryStreamMultiCallable[_consistency_service_pb2.WatchSceneRequest, _consistency_service_pb2.WatchSceneResponse]
     """What is found out about a scene from now on, whichever replica finds it out: at each observation the set
     as it is then, and once more when it settles. The first message is empty: from then on nothing is missed.
+    Over gRPC more empty messages follow while there is nothing to say, every 15 s, so that proxies keep the stream open.
     Ends with the call's deadline, or when the server drains. A reader that is too slow misses the oldest; `missed` says how many.
     """
 
@@ -99,6 +100,7 @@ class ConsistencyServiceAsyncStub(ConsistencyServiceStub):
     WatchScene: _aio.UnaryStreamMultiCallable[_consistency_service_pb2.WatchSceneRequest, _consistency_service_pb2.WatchSceneResponse]  # type: ignore[assignment]
     """What is found out about a scene from now on, whichever replica finds it out: at each observation the set
     as it is then, and once more when it settles. The first message is empty: from then on nothing is missed.
+    Over gRPC more empty messages follow while there is nothing to say, every 15 s, so that proxies keep the stream open.
     Ends with the call's deadline, or when the server drains. A reader that is too slow misses the oldest; `missed` says how many.
     """
 
@@ -163,6 +165,7 @@ class ConsistencyServiceServicer(metaclass=_abc_1.ABCMeta):
     ) -> _typing.Union[_abc.Iterator[_consistency_service_pb2.WatchSceneResponse], _abc.AsyncIterator[_consistency_service_pb2.WatchSceneResponse]]:
         """What is found out about a scene from now on, whichever replica finds it out: at each observation the set
         as it is then, and once more when it settles. The first message is empty: from then on nothing is missed.
+        Over gRPC more empty messages follow while there is nothing to say, every 15 s, so that proxies keep the stream open.
         Ends with the call's deadline, or when the server drains. A reader that is too slow misses the oldest; `missed` says how many.
         """
 
