@@ -44,6 +44,9 @@ class Refusal:
     frame: int
     why: str
 
+    def __str__(self) -> str:
+        return f"{self.model}, {self.scene}, frame {self.frame}: {self.why}"
+
 
 @dataclass(frozen=True)
 class Answer:

@@ -276,8 +276,8 @@ def _paired_difference(
     return Difference(figure, was, now, mean, error, count, interval)
 
 
-def bootstrap_interval(values: Floats, scenes: Ints) -> tuple[float, float]:
-    """Return the 95 % interval of a mean by bootstrap over scenes (Efron's percentile interval).
+def bootstrap_interval(values: Floats, scenes: Ints, divisors: Floats | None = None) -> tuple[float, float]:
+    """Return the 95 % interval of a mean or a ratio by bootstrap over scenes (Efron's percentile interval).
 
     Each of ``RESAMPLES`` resamples draws as many scenes as there are, with replacement, and takes the mean
     over all their values. Equal scenes give equal resamples, whatever the values.
@@ -285,18 +285,24 @@ def bootstrap_interval(values: Floats, scenes: Ints) -> tuple[float, float]:
     Args:
         values: [N], finite.
         scenes: [N], index of each value's scene.
+        divisors: [N], ≥ 0: the figure is the sum of the values over that of the divisors; resamples whose
+            divisors are all 0 are left out. None: the mean of the values.
 
     Returns:
-        Lower and upper bound; NaN for fewer than two scenes.
+        Lower and upper bound; NaN for fewer than two scenes, or if all divisors are 0.
     """
     distinct, members = np.unique(scenes, return_inverse=True)
     count = len(distinct)
     if count < 2:
         return math.nan, math.nan
-    sums, sizes = np.bincount(members, values), np.bincount(members)
+    sums, sizes = np.bincount(members, values), np.bincount(members, divisors)
     generator = np.random.default_rng(SEED)
     drawn = generator.multinomial(count, np.full(count, 1 / count), size=RESAMPLES)
-    means = (drawn @ sums) / (drawn @ sizes)
+    totals = drawn @ sizes
+    kept = totals > 0
+    if not kept.any():
+        return math.nan, math.nan
+    means = (drawn @ sums)[kept] / totals[kept]
     low, high = np.quantile(means, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     return float(low), float(high)
 

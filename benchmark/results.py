@@ -51,6 +51,31 @@ class Latency:
     """Mean number of agents in the batches."""
 
 
+@dataclass(frozen=True)
+class Estimate:
+    """A figure with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+    pairs: int
+    """Number of pairs that it is of."""
+
+
+@dataclass(frozen=True)
+class ContextRun:
+    """How the use of the context was measured."""
+
+    no_context: str
+    """``name@version`` of the model without context."""
+    donors: int
+    """Maximum number of donors of a pair."""
+    cases: int
+    """Number of forecasts of each model with a changed context."""
+    seconds: float
+    """Time that these forecasts took, of all models and replays; it is no part of the benchmark's."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkModelResult(ModelResult):
     """Figures of one model, or of the physics oracle.
@@ -69,11 +94,17 @@ class BenchmarkModelResult(ModelResult):
     lost: int = 0
     """Missing forecasts among those requested for dispersion and convergence only."""
     latency: Latency | None = None
+    context: Mapping[str, Mapping[str, Estimate]] = field(default_factory=dict)
+    """What the context does for the forecasts, by subset of the pairs and by name of the measure (see
+    ``benchmark.context.measures``)."""
+    context_missing: int = 0
+    """Missing forecasts among those with a changed context."""
 
     @property
     def missing(self) -> int:
         """Number of missing forecasts."""
-        return self.statuses.get("MISSING", 0) + self.statuses.get("INVALID", 0) + self.lost
+        lost = self.lost + self.context_missing
+        return self.statuses.get("MISSING", 0) + self.statuses.get("INVALID", 0) + lost
 
     @property
     def fallbacks(self) -> int:
@@ -105,6 +136,8 @@ class BenchmarkResults(Results):
     """Version of this program."""
     refusals: tuple[str, ...] = field(default=())
     """Calls that the endpoint refused, in words."""
+    context: ContextRun | None = None
+    """None: the use of the context was not measured."""
 
     def statement(self) -> str:
         """Return what the figures are computed on, in words; every table carries it."""
@@ -181,5 +214,11 @@ class Instances:
 def _with_nan(document: Any) -> Any:
     """Return the document with null metrics as NaN."""
     for model in document.get("models", []):
-        model["metrics"] = {k: math.nan if v is None else v for k, v in model.get("metrics", {}).items()}
+        model["metrics"] = _known(model.get("metrics", {}))
+        for measures in model.get("context", {}).values():
+            measures.update({name: _known(one) for name, one in measures.items()})
     return document
+
+
+def _known(figures: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: math.nan if value is None else value for name, value in figures.items()}

@@ -12,6 +12,7 @@ from typing import Final
 
 from benchmark.answers import read_answers
 from benchmark.archive import Archive
+from benchmark.context import ContextBenchmark, ContextSettings
 from benchmark.errors import BenchmarkError
 from benchmark.evaluate import Evaluated, evaluate
 from benchmark.hard_cases import HardCase, hard_case, shown_cases
@@ -33,6 +34,7 @@ from model.metrics.pairs import Sampling
 
 IN_PROCESS: Final = "in process"
 """Name of the endpoint in results without one."""
+_CHANGED: Final = "requesting forecasts with a changed context"
 _DRAWN: Final = ("cab", "trajectron")
 """Models whose forecasts of hard cases are drawn; without either, those of the first model."""
 
@@ -98,6 +100,17 @@ class Benchmark:
     """Switch for requesting forecasts for dispersion and convergence, too."""
     limit: int | None = None
     """Number of pairs, from the first; None: all."""
+    context: ContextSettings | None = None
+    """How the use of the context is measured; None: it is not."""
+
+    @cached_property
+    def context_benchmark(self) -> ContextBenchmark | None:
+        """Measures of the use of the context; None: not asked for."""
+        if self.context is None:
+            return None
+        return ContextBenchmark(
+            self.folder, self.scenes, self.protocol, self.sampling.seed, self._properties(), self.context
+        )
 
     @cached_property
     def scenes(self) -> list[PlannedScene]:
@@ -218,11 +231,7 @@ class Benchmark:
             concurrency=int(properties.get("concurrency", 0)),
             version=version("cab-forecast"),
             models=evaluated.models,
-            refusals=tuple(
-                f"{one.model}, {one.scene}, frame {one.frame}: {one.why}"
-                for one in refusals
-                if one.model in models
-            ),
+            refusals=tuple(str(one) for one in refusals if one.model in models),
         )
         return results, evaluated
 
@@ -310,6 +319,11 @@ def run_benchmark(
         models = _replay_in_process(benchmark, source, names, progress)
     with progress.task("evaluating", benchmark.pairs, "pairs") as tick:
         results, evaluated = benchmark.evaluate(models, processes, tick)
+    if benchmark.context_benchmark is not None:
+        total = len(benchmark.context_benchmark.cases) * len(models)
+        with progress.task("evaluating changed contexts", total, "forecasts") as tick:
+            context = benchmark.context_benchmark.evaluate(list(models), evaluated, tick)
+        results, evaluated = context.add_to(results, evaluated)
     out.mkdir(parents=True, exist_ok=True)
     results.write(out)
     evaluated.instances.write(out)
@@ -346,10 +360,17 @@ async def _replay(
         key_file=endpoint.key_file,
     ) as client:
         models = _selected(await listed_models(client), benchmark.protocol, names, progress, "the endpoint")
+        context = _checked_context(benchmark, models)
         total = benchmark.forecasts * len(models)
         with progress.task(f"requesting {len(models)} models", total, "forecasts") as tick:
             replayed = await benchmark.replay(client, endpoint, models, tick)
-    _note_rate(replayed, progress)
+        _note_rate(replayed, progress)
+        if context is not None:
+            with progress.task(_CHANGED, len(context.cases) * len(models), "forecasts") as tick:
+                replayed = await context.replay(
+                    client, models, endpoint.address, endpoint.concurrency, endpoint.timeout, tick
+                )
+            _note_rate(replayed, progress, " with a changed context")
     return models
 
 
@@ -359,11 +380,25 @@ def _replay_in_process(
     by_key = {one.info.full_name: one for one in forecasters}
     listed = [describe(one.info) for one in forecasters]
     models = _selected(listed, benchmark.protocol, names, progress, "this process")
+    chosen = {name: by_key[name] for name in models}
+    context = _checked_context(benchmark, models)
     total = benchmark.forecasts * len(models)
     with progress.task(f"running {len(models)} models", total, "forecasts") as tick:
-        replayed = benchmark.replay_in_process({name: by_key[name] for name in models}, tick)
+        replayed = benchmark.replay_in_process(chosen, tick)
     _note_rate(replayed, progress)
+    if context is not None:
+        with progress.task(_CHANGED, len(context.cases) * len(models), "forecasts") as tick:
+            replayed = context.replay_in_process(IN_PROCESS, chosen, tick)
+        _note_rate(replayed, progress, " with a changed context")
     return models
+
+
+def _checked_context(benchmark: Benchmark, models: Mapping[str, Model]) -> ContextBenchmark | None:
+    """Return the measures of the context, if they are asked for and can be made of these models."""
+    context = benchmark.context_benchmark
+    if context is not None:
+        context.check(list(models))
+    return context
 
 
 def _selected(
@@ -376,10 +411,10 @@ def _selected(
     return models
 
 
-def _note_rate(replayed: Replayed, progress: Progress) -> None:
+def _note_rate(replayed: Replayed, progress: Progress, of: str = "") -> None:
     rate = replayed.requested / replayed.seconds if replayed.seconds else 0.0
     progress.note(
-        f"requested {replayed.requested} forecasts in {replayed.seconds:.1f} s ({rate:.0f} forecasts/s)"
+        f"requested {replayed.requested} forecasts{of} in {replayed.seconds:.1f} s ({rate:.0f} forecasts/s)"
     )
 
 

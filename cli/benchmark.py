@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from benchmark import BenchmarkRun, Endpoint, Progress
 
 _SAMPLES = 2000
+_DONORS = 2
 _REFUSALS_SHOWN = 5
 
 
@@ -60,6 +61,21 @@ def benchmark(
         bool,
         typer.Option("--consistency/--no-consistency", help="Also compute dispersion and convergence."),
     ] = True,
+    measure_context: Annotated[
+        bool, typer.Option("--context", help="Also measure what the context does for the forecasts.")
+    ] = False,
+    donors: Annotated[
+        int, typer.Option(min=1, help="With --context: wrong maps, and wrong neighbours, for each pair.")
+    ] = _DONORS,
+    no_context_model: Annotated[
+        str, typer.Option(help="With --context: the model without context, to compare with.")
+    ] = "trajectron-no-context",
+    no_context_answers: Annotated[
+        Path | None,
+        typer.Option(
+            exists=True, file_okay=False, help="With --context: folder of a run with that model's responses."
+        ),
+    ] = None,
     limit: Annotated[int | None, typer.Option(min=1, help="Evaluate the first LIMIT pairs only.")] = None,
     seed: Annotated[int, typer.Option(min=0, max=2000, help="Seed of all random draws.")] = 0,
     concurrency: Annotated[int, typer.Option(min=1, help="Concurrent requests.")] = 16,
@@ -80,6 +96,7 @@ def benchmark(
     if data is None or folder is None:
         fail("--data and --out are needed (--data and --from, to evaluate saved responses)")
     from benchmark import Benchmark, BenchmarkError, run_benchmark
+    from benchmark.context import ContextSettings
     from model.data.scenes import DataError
     from model.data.sources import READERS, parse_data, parse_protocol
     from model.metrics.density import DRAWS
@@ -100,6 +117,7 @@ def benchmark(
                 Sampling(samples, DRAWS if samples else 0, seed),
                 consistency,
                 limit,
+                ContextSettings(donors, no_context_model, no_context_answers) if measure_context else None,
             ),
             None if saved else _endpoint(connection, concurrency, timeout),
             folder,

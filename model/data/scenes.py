@@ -31,9 +31,18 @@ class Track:
 
     def positions(self, frames: Ints) -> Floats:
         """Return positions at frames [...]: [..., 2], m, ground frame; NaN where not annotated."""
-        row = np.minimum(np.searchsorted(self.frames, frames), len(self.frames) - 1)
-        there = self.frames[row] == frames
+        row, there = self._rows(frames)
         return np.where(there[..., None], self.position[row], np.nan)
+
+    def headings(self, frames: Ints) -> Floats:
+        """Return headings at frames [...]: [...], rad; NaN where not annotated."""
+        row, there = self._rows(frames)
+        return np.where(there, self.heading[row], np.nan)
+
+    def _rows(self, frames: Ints) -> tuple[Ints, Bools]:
+        """Return the row of each frame, and whether the track has it: [...] each."""
+        row = np.minimum(np.searchsorted(self.frames, frames), len(self.frames) - 1)
+        return row, np.asarray(self.frames[row] == frames)
 
 
 @dataclass(frozen=True)

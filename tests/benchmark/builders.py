@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmark.hard_cases import CaseForecast, HardCase
 from benchmark.models import BASELINES
-from benchmark.results import BenchmarkModelResult, BenchmarkResults, Latency
+from benchmark.results import BenchmarkModelResult, BenchmarkResults, ContextRun, Estimate, Latency
 from model.forecaster import Protocol
 from model.metrics.consistency import RANGES_M
 from model.metrics.evaluate import MOVING, MOVING_FIGURES
@@ -39,6 +39,15 @@ LATENCY = Latency(
     inference_p50_s=0.0055,
     batch_agents_mean=7.25,
 )
+
+MEASURES: dict[str, Estimate] = {
+    "gain_m": Estimate(1.25, 0.5, 2.0, 10),
+    "map_advantage_m": Estimate(-0.25, -0.5, 0.125, 9),
+    "neighbors_advantage_m": Estimate(0.5, 0.25, 0.75, 8),
+    "map_control_m": Estimate(0.0, -0.0625, 0.0625, 10),
+    "map_control_size_m": Estimate(0.125, 0.0, 0.25, 10),
+    "compliance": Estimate(0.75, 0.5, 1.0, 7),
+}
 
 
 def made_metrics(scale: float = 1.0) -> dict[str, float]:
@@ -86,13 +95,14 @@ def made_model(
         metrics=made_metrics() if metrics is None else metrics,
         instants=30,
         latency=LATENCY,
+        context={"all": MEASURES, "turns after now": {"gain_m": Estimate(7.5, math.nan, math.nan, 3)}},
     )
 
 
 def made_oracle() -> BenchmarkModelResult:
     """The oracle, which nobody calls."""
     oracle = made_model("physics-oracle", "", "any", made_metrics(1.1))
-    return replace(oracle, latency=None, instants=0, statuses={})
+    return replace(oracle, latency=None, instants=0, statuses={}, context={})
 
 
 def made_results(*models: BenchmarkModelResult, protocol: Protocol = Protocol.CAUSAL) -> BenchmarkResults:
@@ -112,6 +122,7 @@ def made_results(*models: BenchmarkModelResult, protocol: Protocol = Protocol.CA
         concurrency=16,
         version="0.1.0",
         models=models or (made_model(),),
+        context=ContextRun("trajectron-no-context@1.0.0", donors=2, cases=50, seconds=12.25),
     )
 
 

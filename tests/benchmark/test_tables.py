@@ -36,6 +36,7 @@ def test_every_table_says_what_it_is_of() -> None:
         "7.2",
         "7.3",
         "8",
+        "9",
     ]
     statement = "causal protocol, made split some, the first 10 pairs only, seed 3"
     assert all(statement in table.note for table in made)
@@ -76,6 +77,26 @@ def test_figures_stand_in_their_columns() -> None:
 def test_latency_is_in_milliseconds_and_has_no_oracle() -> None:
     table = titled(tables(made_results(made_model(), made_oracle())), "Latency")
     assert table.rows == (("cab@1.0.0", "40", "12.3", "34.5", "98.7", "1.1", "5.5", "7.2"),)
+
+
+def test_the_use_of_the_context_has_a_row_for_each_set_of_pairs() -> None:
+    table = titled(tables(made_results(made_model(), made_oracle())), "9. Use of the context")
+    assert table.rows == (
+        (
+            "cab@1.0.0",
+            "all",
+            "10",
+            "+1.25 (+0.50 … +2.00)",
+            "-0.25 (-0.50 … +0.12)",
+            "+0.50 (+0.25 … +0.75)",
+            "+0.00 (-0.06 … +0.06)",
+            "0.12 (0.00 … 0.25)",
+            "0.75 (0.50 … 1.00)",
+        ),
+        ("cab@1.0.0", "turns after now", "3", "+7.50", "-", "-", "-", "-", "-"),
+    )
+    assert "FDE of trajectron-no-context@1.0.0 minus" in table.note
+    assert "50 forecasts of each model, 12 s beside the benchmark's" in table.note
 
 
 def test_pairs_by_status() -> None:
@@ -143,10 +164,12 @@ def test_what_the_paper_has_not_is_a_dash() -> None:
 
 def test_a_table_with_nothing_to_say_is_left_out_and_says_why() -> None:
     model = made_model("kalman", metrics=without("dispersion", "convergence", "hardest"))
-    results = replace(made_results(replace(model, instants=0, latency=None, statuses={})), consistency=False)
+    bare = replace(model, instants=0, latency=None, statuses={}, context={})
+    results = replace(made_results(bare), consistency=False, context=None)
     assert [table.title[0] for table in tables(results)] == ["1", "4", "4", "4", "5"]
     reasons = left_out(results)
-    assert len(reasons) == 7
+    assert len(reasons) == 8
+    assert "9. Use of the context: left out: it was not measured (--context)" in reasons
     assert (
         "2. Dispersion and convergence: left out: forecasts for dispersion and convergence were not requested"
         in reasons

@@ -1,0 +1,218 @@
+"""Requests and evaluation of forecasts with a changed context, beside those of a benchmark."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Final
+
+from benchmark.archive import Archive, Refusal
+from benchmark.context.cases import Cases, ContextSettings
+from benchmark.context.measures import (
+    ContextEvaluation,
+    context_subsets,
+    measure_context,
+    no_context_paths,
+)
+from benchmark.errors import BenchmarkError
+from benchmark.evaluate import Evaluated
+from benchmark.in_process import replay_in_process
+from benchmark.models import describe, select
+from benchmark.plan import PlannedScene
+from benchmark.replay import Replay, Replayed
+from benchmark.results import BenchmarkResults, ContextRun, Estimate
+from cab.forecast.v1.model_service_pb2 import Model
+from cab_forecast import AsyncClient
+from model.arrays import Floats
+from model.forecaster import Forecaster, Protocol
+
+FOLDER: Final = "context"
+"""Folder of the answers about the cases, inside that of the run."""
+_SECONDS: Final = "seconds"
+_FDE: Final = "fde_ml_6s_m"
+
+
+@dataclass(frozen=True)
+class ContextEvaluated:
+    """Measures of all models."""
+
+    run: ContextRun
+    measures: Mapping[str, Mapping[str, Mapping[str, Estimate]]]
+    """By ``name@version``, subset and name."""
+    missing: Mapping[str, int]
+    """Number of cases without a forecast, by ``name@version``."""
+    each: Mapping[str, Floats]
+    """[pairs], m, differences of errors by ``<name@version>/<name>``, NaN where unknown."""
+    refusals: Sequence[Refusal]
+    """Calls that the endpoint refused."""
+
+    def add_to(self, results: BenchmarkResults, evaluated: Evaluated) -> tuple[BenchmarkResults, Evaluated]:
+        """Return results and the figures of each pair with these measures."""
+        models = tuple(
+            replace(
+                model,
+                context=self.measures.get(model.key, {}),
+                context_missing=self.missing.get(model.key, 0),
+            )
+            for model in results.models
+        )
+        refusals = (*results.refusals, *map(str, self.refusals))
+        instances = replace(evaluated.instances, figures={**evaluated.instances.figures, **self.each})
+        return (
+            replace(results, models=models, context=self.run, refusals=refusals),
+            replace(evaluated, instances=instances),
+        )
+
+
+@dataclass(frozen=True)
+class ContextBenchmark:
+    """Measures of what the context does for the forecasts of a benchmark."""
+
+    folder: Path
+    """Folder of the benchmark's answers."""
+    scenes: Sequence[PlannedScene]
+    protocol: Protocol
+    seed: int
+    properties: Mapping[str, str]
+    """Properties of the benchmark, which its answers are bound to."""
+    settings: ContextSettings
+
+    @cached_property
+    def cases(self) -> Cases:
+        """All cases."""
+        return Cases(self.scenes, self.settings.donors, self.seed)
+
+    def check(self, models: Sequence[str]) -> None:
+        """Refuse to begin without a model to compare with.
+
+        Args:
+            models: ``name@version`` of the models that will be asked.
+
+        Raises:
+            BenchmarkError: the model without context is not among them, and has no saved answers.
+        """
+        name = self.settings.no_context
+        asked = any(name in (key, key.partition("@")[0]) for key in models)
+        if self.settings.no_context_answers is not None or not asked:
+            try:
+                self._no_context()
+            except BenchmarkError as error:
+                raise BenchmarkError(
+                    f"the measures of the context need forecasts of {name!r}: ask it, too, or give a folder "
+                    f"with its answers: {error}"
+                ) from error
+
+    async def replay(
+        self,
+        client: AsyncClient,
+        models: Mapping[str, Model],
+        address: str,
+        concurrency: int,
+        patience: float,
+        tick: Callable[[int], None],
+    ) -> Replayed:
+        """Request the forecasts of all cases without a saved answer from an endpoint.
+
+        Args:
+            client: client of the endpoint.
+            models: models by ``name@version``.
+            address: address of the endpoint.
+            concurrency: maximum number of concurrent calls.
+            patience: seconds for a call with its retries.
+            tick: called with the number of forecasts of every call, saved ones included.
+
+        Raises:
+            BenchmarkError: the folder holds answers of another run, or the endpoint does not answer.
+        """
+        with self._bound_archive(address, models) as archive:
+            cases = self._unanswered(archive, list(models), tick)
+            replay = Replay(cases, models, self.protocol, concurrency, patience)
+            return _timed(archive, await replay.run(client, archive, tick))
+
+    def replay_in_process(
+        self, address: str, forecasters: Mapping[str, Forecaster], tick: Callable[[int], None]
+    ) -> Replayed:
+        """Make the forecasts of all cases without a saved answer in this process.
+
+        Args:
+            address: name of this process.
+            forecasters: forecasters by ``name@version``.
+            tick: called with the number of forecasts of every call, saved ones included.
+
+        Raises:
+            BenchmarkError: the folder holds answers of another run.
+        """
+        models = {name: describe(one.info) for name, one in forecasters.items()}
+        with self._bound_archive(address, models) as archive:
+            cases = self._unanswered(archive, list(models), tick)
+            return _timed(archive, replay_in_process(cases, forecasters, self.protocol, archive, tick))
+
+    def evaluate(
+        self, models: Sequence[str], evaluated: Evaluated, tick: Callable[[int], None] = lambda cases: None
+    ) -> ContextEvaluated:
+        """Evaluate the saved answers.
+
+        Args:
+            models: ``name@version`` of the models.
+            evaluated: evaluation of the benchmark.
+            tick: called with the number of cases that are done.
+
+        Raises:
+            BenchmarkError: answers are missing, are those of another run, or do not fit their calls.
+        """
+        folder, reference = self._no_context()
+        with Archive(folder, read_only=True) as archive:
+            paths = no_context_paths(archive, reference, self.scenes)
+        evaluation = ContextEvaluation(self.cases, self.scenes, paths)
+        no_context_fde_m = evaluation.no_context_fde_m()
+        subsets = context_subsets(self.scenes, evaluated.mismatch_m)
+        measures, missing, each = {}, {}, {}
+        with Archive(self.folder / FOLDER, read_only=True) as archive:
+            archive.check(self._properties())
+            for model in models:
+                own = evaluated.instances.figures.get(f"{model}/{_FDE}")
+                if own is None:
+                    continue
+                figures = evaluation.figures(archive, model, own, tick)
+                measures[model] = measure_context(figures, no_context_fde_m, subsets, evaluation.scene_of)
+                missing[model] = figures.missing
+                for name, values in figures.differences(no_context_fde_m).items():
+                    each[f"{model}/{name}"] = values
+            run = ContextRun(
+                reference, self.settings.donors, len(self.cases), float(archive.facts().get(_SECONDS, "0"))
+            )
+            refusals = [one for one in archive.refusals() if one.model in models]
+            return ContextEvaluated(run, measures, missing, each, refusals)
+
+    def _no_context(self) -> tuple[Path, str]:
+        """Return the folder with answers of the model without context, and its ``name@version``."""
+        folder = self.settings.no_context_answers or self.folder
+        with Archive(folder, read_only=True) as archive:
+            archive.check(self.properties)
+            saved = list(archive.models().values())
+        (model,) = select(saved, self.protocol, [self.settings.no_context], str(folder))
+        return folder, model
+
+    def _unanswered(self, archive: Archive, models: Sequence[str], tick: Callable[[int], None]) -> Cases:
+        left = self.cases.unanswered(archive.answered(), models)
+        tick((len(self.cases) - len(left)) * len(models))
+        return left
+
+    @contextmanager
+    def _bound_archive(self, address: str, models: Mapping[str, Model]) -> Iterator[Archive]:
+        with Archive(self.folder / FOLDER) as archive:
+            archive.bind(self._properties())
+            archive.note("endpoint", address)
+            for name, model in models.items():
+                archive.register(name, model)
+            yield archive
+
+    def _properties(self) -> dict[str, str]:
+        return {**self.properties, "donors": str(self.settings.donors), "seed": str(self.seed)}
+
+
+def _timed(archive: Archive, replayed: Replayed) -> Replayed:
+    """Add the duration of a replay to that of earlier ones."""
+    archive.note(_SECONDS, str(float(archive.facts().get(_SECONDS, "0")) + replayed.seconds))
+    return replayed
