@@ -156,7 +156,7 @@ class Settings(BaseSettings):
     progress go on to their end. None: connections may stay open for good."""
     drain_seconds: float = Field(default=10.0, ge=0)
     """Seconds that accepted calls get to finish when the server stops."""
-    threads: int | None = Field(default=None, ge=1)
+    threads: int | None = Field(default=None, ge=1, le=1024)
     """Number of threads of the forward; None: the physical cores, at most the cores of the CPU quota."""
     engine: Engine = Engine.ONNXRUNTIME
     """Engine of the forward: ``onnxruntime`` runs networks of the agent's frame as one native call and all
