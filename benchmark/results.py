@@ -72,8 +72,10 @@ class ContextRun:
     """Maximum number of donors of a pair."""
     cases: int
     """Number of forecasts of each model with a changed context."""
+    timed: int
+    """Number of forecasts that were timed: of all models, without those of replays that were killed."""
     seconds: float
-    """Time that these forecasts took, of all models and replays; it is no part of the benchmark's."""
+    """Time that these took; it is no part of the benchmark's."""
 
 
 @dataclass(frozen=True, kw_only=True)

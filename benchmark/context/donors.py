@@ -122,6 +122,8 @@ class DonorPool:
         if not size:
             return found
         for candidate in self._candidates(number, 1):
+            if len(self.neighbors(candidate)) < size:
+                continue
             free = self._free_neighbors(self.agents[number], candidate)
             if len(free) >= size:
                 found.append((candidate, free[:size]))
@@ -158,11 +160,9 @@ class DonorPool:
         yield from self.random(number, purpose).permutation(others)[:TRIES].tolist()
 
     def _free_neighbors(self, agent: Agent, candidate: int) -> Ints:
-        """Return the tracks of a donor's neighbours that do not overlap with the agent's past."""
+        """Return those tracks of a donor's neighbours that do not overlap with the agent's past."""
         donor, tracks = self.agents[candidate], self.neighbors(candidate)
         record = self.scenes[donor.scene].record
-        if not len(tracks):
-            return tracks
         seen = np.stack([record.tracks[track].positions(donor.frame + _BACK) for track in tracks])
         offset = Move(donor.pose, agent.pose).points(seen) - agent.past
         ahead, left = np.moveaxis(np.abs(rotate(offset, -agent.past_heading)), -1, 0)

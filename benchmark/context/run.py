@@ -29,6 +29,7 @@ from model.forecaster import Forecaster, Protocol
 
 FOLDER: Final = "context"
 """Folder of the answers about the cases, inside that of the run."""
+_TIMED: Final = "timed"
 _SECONDS: Final = "seconds"
 _FDE: Final = "fde_ml_6s_m"
 
@@ -179,9 +180,7 @@ class ContextBenchmark:
                 missing[model] = figures.missing
                 for name, values in figures.differences(no_context_fde_m).items():
                     each[f"{model}/{name}"] = values
-            run = ContextRun(
-                reference, self.settings.donors, len(self.cases), float(archive.facts().get(_SECONDS, "0"))
-            )
+            run = ContextRun(reference, self.settings.donors, len(self.cases), *_durations(archive))
             refusals = [one for one in archive.refusals() if one.model in models]
             return ContextEvaluated(run, measures, missing, each, refusals)
 
@@ -212,7 +211,15 @@ class ContextBenchmark:
         return {**self.properties, "donors": str(self.settings.donors), "seed": str(self.seed)}
 
 
+def _durations(archive: Archive) -> tuple[int, float]:
+    """Return how many forecasts were timed, and the seconds that they took."""
+    facts = archive.facts()
+    return int(facts.get(_TIMED, "0")), float(facts.get(_SECONDS, "0"))
+
+
 def _timed(archive: Archive, replayed: Replayed) -> Replayed:
     """Add the duration of a replay to that of earlier ones."""
-    archive.note(_SECONDS, str(float(archive.facts().get(_SECONDS, "0")) + replayed.seconds))
+    timed, seconds = _durations(archive)
+    archive.note(_TIMED, str(timed + replayed.requested))
+    archive.note(_SECONDS, str(seconds + replayed.seconds))
     return replayed

@@ -122,7 +122,7 @@ def made_results(*models: BenchmarkModelResult, protocol: Protocol = Protocol.CA
         concurrency=16,
         version="0.1.0",
         models=models or (made_model(),),
-        context=ContextRun("trajectron-no-context@1.0.0", donors=2, cases=50, seconds=12.25),
+        context=ContextRun("trajectron-no-context@1.0.0", donors=2, cases=50, timed=100, seconds=12.25),
     )
 
 

@@ -225,6 +225,14 @@ def test_the_interval_is_a_bootstrap_over_scenes_by_hand() -> None:
     assert three == (0.0, 6.0)
 
 
+def test_the_interval_of_a_ratio_by_hand() -> None:
+    """As above, with the sums 3 and 5 over 2 and 0; twice the second scene has no ratio and is left out."""
+    values, scenes = np.array([1.0, 2.0, 5.0]), np.array([3, 3, 7])
+    assert bootstrap_interval(values, scenes, np.array([1.0, 1.0, 0.0])) == (1.5, 4.0)
+    assert bootstrap_interval(values, scenes, np.ones(3)) == bootstrap_interval(values, scenes)
+    assert np.isnan(bootstrap_interval(values, scenes, np.zeros(3))).all()
+
+
 def test_the_interval_of_many_scenes_is_that_of_the_normal_distribution() -> None:
     """Scenes of 4 equal pairs: pairs taken as independent would halve the interval."""
     scenes = np.repeat(np.arange(400), 4)

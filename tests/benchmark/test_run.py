@@ -2,7 +2,7 @@
 
 import asyncio
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from benchmark.archive import Archive
+from benchmark.context import ContextSettings
 from benchmark.errors import BenchmarkError
 from benchmark.evaluate import Evaluated
 from benchmark.models import BASELINES, select
@@ -24,7 +25,7 @@ from cab.forecast.v1.prediction_service_pb2 import FORECAST_STATUS_FALLBACK
 from cab_forecast import AsyncClient
 from model.evaluation import selection
 from model.evaluation.run import Evaluation
-from model.forecaster import Protocol
+from model.forecaster import Forecaster, Protocol
 from model.metrics.density import DRAWS
 from model.metrics.oracle import ORACLE, PHYSICS
 from model.metrics.pairs import Sampling
@@ -298,6 +299,37 @@ def test_one_call_runs_a_whole_benchmark_in_process(tmp_path: Path, server: Serv
     assert progress.steps == progress.totals
     assert set(progress.steps) == {"reading the data", f"running {len(forecasters)} models", "evaluating"}
     assert any(note.startswith("requested ") for note in progress.notes)
+
+
+def test_the_use_of_the_context_is_the_same_through_an_endpoint(
+    tmp_path: Path, server: Server, models: Path
+) -> None:
+    names = ["cab", "kalman", "constant-velocity-yaw"]
+    chosen = selection.select(models, Protocol.CAUSAL, names)
+    forecasters = [*chosen.baselines, *(one.forecaster for one in chosen.learned)]
+    context = ContextSettings(donors=1, no_context="constant-velocity-yaw")
+    address = Endpoint(f"grpc://{server.grpc_address}", concurrency=4, timeout=30)
+    sources: tuple[Sequence[Forecaster], Endpoint] = (forecasters, address)
+    found = []
+    for number, source in enumerate(sources):
+        folder = tmp_path / str(number)
+        whole = replace(made(folder, limit=40), sampling=Sampling(0, 0), consistency=False, context=context)
+        results = run_benchmark(whole, source, folder, names=names).results
+        assert results.missing == 0
+        found.append({model.key: model.context for model in results.models})
+    local, remote = found
+    assert local.keys() == remote.keys()
+    assert local["cab@1.0.0"]["all"]["map_advantage_m"].pairs > 0
+    assert "hardest 10 %" in local["cab@1.0.0"]
+    for key, subsets in local.items():
+        for subset, measures in subsets.items():
+            assert measures.keys() == remote[key][subset].keys()
+            for name, one in measures.items():
+                other = remote[key][subset][name]
+                assert one.pairs == other.pairs
+                assert (one.value, one.low, one.high) == pytest.approx(
+                    (other.value, other.low, other.high), rel=1e-3, abs=1e-3, nan_ok=True
+                ), (key, subset, name)
 
 
 def test_saved_answers_of_this_process_are_not_made_again(tmp_path: Path, models: Path) -> None:

@@ -189,6 +189,10 @@ def test_data_with_tokens_gives_submissions_of_who_answered_it_all(
         (("--data", "{data}", "--out", "{out}", "--endpoint", "127.0.0.1:1"), "the endpoint does not answer"),
         (("--data", "{data}", "--from", "{empty}"), "there are no saved answers"),
         (("compare", "{empty}", "{empty}"), "results.json"),
+        (
+            ("--data", "{data}", "--out", "{out}", "--models", "kalman", "--context"),
+            "the measures of the context need forecasts of 'trajectron-no-context': ask it, too",
+        ),
     ],
 )
 def test_what_cannot_be_done_is_said(
@@ -205,6 +209,19 @@ def test_what_cannot_be_done_is_said(
     assert code == 1
     assert said in errors
     assert "Traceback" not in errors + shown
+
+
+def test_the_use_of_the_context(tmp_path: Path, data: str, server: Server) -> None:
+    asked = ("--data", data, "--out", str(tmp_path), "--endpoint", f"grpc://{server.grpc_address}")
+    fast = ("--no-consistency", "--samples", "0", "--processes", "1", "--models", MODELS)
+    context = ("--context", "--donors", "1", "--no-context-model", "kalman@1.0.0")
+    code, shown, said = run(*asked, *fast, *context)
+    assert code == 0, said
+    assert "9. Use of the context" in shown
+    assert "forecasts with a changed context in" in said
+    read = results(tmp_path)
+    assert (read["context"]["no_context"], read["context"]["donors"]) == ("kalman@1.0.0", 1)
+    assert read["models"][0]["context"]["all"]["gain_m"]["pairs"] == PAIRS
 
 
 def test_the_data_on_disk_is_the_one_in_memory(data: str) -> None:

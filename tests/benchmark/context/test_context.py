@@ -91,6 +91,7 @@ def test_results_are_written_and_read(tmp_path: Path) -> None:
     assert BenchmarkResults.read(tmp_path) == results
     assert results.context is not None
     assert (results.context.no_context, results.context.donors) == ("neither@1.0.0", 2)
+    assert results.context.timed == 2 * results.context.cases == 60
     assert "9. Use of the context" in (tmp_path / "tables.md").read_text()
     with np.load(tmp_path / "instances.npz") as each:
         assert each["both@1.0.0/map_advantage_m"].mean() == pytest.approx(
@@ -117,3 +118,15 @@ def test_a_lost_forecast_is_missed(tmp_path: Path) -> None:
     found = run_benchmark(whole, None, tmp_path).results
     assert found.missing == 1
     assert measures(found, "both")["map_control_m"].pairs == len(WORLDS) - 1
+
+
+def test_answers_of_other_donors_are_refused(tmp_path: Path) -> None:
+    run(tmp_path, BOTH, NEITHER)
+    with pytest.raises(BenchmarkError, match="donors was 2, is 1"):
+        run_benchmark(made(tmp_path, replace(SETTINGS, donors=1)), None, tmp_path)
+
+
+def test_saved_answers_without_a_changed_context_are_not_enough(tmp_path: Path) -> None:
+    run_benchmark(made(tmp_path, None), [BOTH, NEITHER], tmp_path)
+    with pytest.raises(BenchmarkError, match=r"context/answers\.sqlite: there are no saved answers"):
+        run_benchmark(made(tmp_path), None, tmp_path)
