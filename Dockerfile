@@ -24,6 +24,9 @@ ENV PATH=/opt/cab-forecast/bin:$PATH \
     FORECAST_GRPC=0.0.0.0:50051 \
     FORECAST_PROBES=127.0.0.1:8081 \
     FORECAST_LOG_JSON=true
+# The revision of the source, which GetVersion and forecast_build_info tell
+ARG REVISION=""
+ENV FORECAST_REVISION=$REVISION
 # It listens on all addresses, so it starts only with keys, or if it is told to allow anyone: see docs/security.md
 USER 10001
 EXPOSE 8080 50051

@@ -18,12 +18,19 @@ from cab.forecast.v1.consistency_service_pb2 import (
     WatchSceneRequest,
     WatchSceneResponse,
 )
-from cab.forecast.v1.model_service_pb2 import GetModelRequest, ListModelsRequest, Model
+from cab.forecast.v1.model_service_pb2 import (
+    GetModelRequest,
+    GetVersionRequest,
+    GetVersionResponse,
+    ListModelsRequest,
+    Model,
+)
 from cab.forecast.v1.prediction_service_pb2 import PredictRequest, PredictResponse
 from cab.forecast.v1.routes import (
     GET_AGENT_CONSISTENCY,
     GET_MODEL,
     GET_SCENE_CONSISTENCY,
+    GET_VERSION,
     LIST_MODEL_CONSISTENCY,
     LIST_MODELS,
     PREDICT,
@@ -165,6 +172,14 @@ class Client:
             ValueError: the name is empty.
         """
         return self._call(GET_MODEL, _get_model_request(name), timeout).model
+
+    def get_version(self, timeout: float | None = None) -> GetVersionResponse:
+        """Return the version of the server.
+
+        Raises:
+            ForecastError: the call failed; the subclass says why.
+        """
+        return self._call(GET_VERSION, GetVersionRequest(), timeout)
 
     def agent_consistency(
         self, scene_id: str, agent_id: str, window: float | None = None, timeout: float | None = None
@@ -335,6 +350,10 @@ class AsyncClient:
     async def get_model(self, name: str, timeout: float | None = None) -> Model:  # noqa: ASYNC109
         """See ``Client.get_model``."""
         return (await self._call(GET_MODEL, _get_model_request(name), timeout)).model
+
+    async def get_version(self, timeout: float | None = None) -> GetVersionResponse:  # noqa: ASYNC109
+        """See ``Client.get_version``."""
+        return await self._call(GET_VERSION, GetVersionRequest(), timeout)
 
     async def agent_consistency(
         self,

@@ -130,7 +130,7 @@ class Server:
         self._grpc.set_serving(False)
         grace = 0.0
         if drain:
-            _log.info("draining")
+            _log.warning("draining", seconds=self.settings.drain_seconds)
             await self.dataplane.drain(self.settings.drain_seconds)
             grace = max(started + self.settings.drain_seconds - time.perf_counter(), 0.0)
         await asyncio.gather(self._grpc.stop(grace), *(server.stop(grace) for server in self._http_servers()))
@@ -239,7 +239,7 @@ def _load_models(settings: Settings, current: Models | None) -> Models:
     models = load_models(settings, current)
     if current is None:
         folder = models_folder(settings)
-        _log.info(
+        _log.warning(
             "models loaded",
             folder=str(folder) if folder else None,
             models=[info.full_name for info in models.infos()],

@@ -173,6 +173,8 @@ class Settings(BaseSettings):
     record_files: int = Field(default=16, ge=2)
     """Max number of files in the folder of the recording; the oldest ones are deleted."""
 
+    revision: str = ""
+    """Revision of the source that this server was built from, for GetVersion and ``forecast_build_info``."""
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     """Least severe level that is logged."""
     log_json: bool = False

@@ -1,6 +1,7 @@
 """Service without its transports: construction, start and end of everything that a call needs."""
 
 import asyncio
+import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 
 import structlog
@@ -21,6 +22,7 @@ from service.predict.shadow import Shadow
 from service.predict.torch_threads import forward_threads, set_helper_threads
 from service.recording.factory import make_recorder
 from service.settings import Settings, split_shadow
+from service.telemetry.build import build_of
 from service.telemetry.metrics import Metrics
 from service.tracking.collector import ConsistencyCollector, StoreMetrics
 from service.tracking.model_references import ModelReferences
@@ -42,6 +44,8 @@ class DataPlane:
     def __init__(self, settings: Settings, metrics: Metrics) -> None:
         self._settings = settings
         self._metrics = metrics
+        self._build = build_of(settings.revision)
+        metrics.set_build(self._build)
         self._lifecycle = Lifecycle()
         self._references = ModelReferences()
         self._admission = Admission(settings.max_batch_agents, settings.max_queue_agents, metrics)
@@ -56,9 +60,9 @@ class DataPlane:
         self._store = make_store(settings)
         self._shadow_guard: Guard | None = None
         store_metrics = StoreMetrics(metrics.registry)
-        self._guard = Guard(store_metrics.observe, store_metrics.failed)
+        self._guard = Guard(store_metrics.observe, store_metrics.failed, calls="forecasts")
         # A guard of their own, so that slow consistency calls do not open the circuit of the forecasts
-        self._asking = Guard(store_metrics.observe, store_metrics.failed)
+        self._asking = Guard(store_metrics.observe, store_metrics.failed, calls="consistency")
         tracker = Tracker(
             self._store, self._guard, self._asking, settings.store_budget_ms / 1000, self._references
         )
@@ -134,7 +138,7 @@ class DataPlane:
         self._pipeline.recorder = make_recorder(self._settings, self._metrics)
         self._reloader = Reloader(load, self._settings, self._batcher, self._metrics, self._take_over)
         self._batcher.start(self._lifecycle.fail)
-        await self._reloader.start()
+        await asyncio.gather(self._reloader.start(), self._guard.check(self._store.ping))
         self._lifecycle.set_ready()
         if self._settings.reload_seconds is not None:
             self._following = asyncio.create_task(
@@ -170,7 +174,7 @@ class DataPlane:
         """Return the tracker of the shadow model, with a guard of its own; None if there is no such model."""
         if self._settings.shadow is None:
             return None
-        self._shadow_guard = Guard(store_metrics.observe, store_metrics.failed)
+        self._shadow_guard = Guard(store_metrics.observe, store_metrics.failed, calls="shadow")
         return Tracker(
             self._store,
             self._shadow_guard,
@@ -250,3 +254,8 @@ class DataPlane:
             raise BadField("name", "is required")
         catalog = self._pipeline.catalog
         return pb.GetModelResponse(model=catalog.describe(catalog.get(request.name).info))
+
+    async def get_version(self, request: pb.GetVersionRequest) -> pb.GetVersionResponse:
+        """Return the version of the server, in every phase."""
+        contract = pb.DESCRIPTOR.package
+        return pb.GetVersionResponse(contract=contract, **dataclasses.asdict(self._build))

@@ -35,7 +35,7 @@ from service.predict.track_updates import (
     with_histories,
 )
 from service.settings import Settings
-from service.telemetry.metrics import Metrics
+from service.telemetry.metrics import FORECAST_STATUSES, Metrics
 from service.tracking.tracker import Tracker, TrackingResult
 
 if TYPE_CHECKING:
@@ -241,8 +241,7 @@ class Pipeline:
     def _count_agents(self, plan: Plan) -> None:
         name = plan.forecaster.info.name
         for status, count in Counter(draft.status for draft in plan.drafts).items():
-            text = pb.ForecastStatus.Name(status).removeprefix("FORECAST_STATUS_").lower()
-            self._metrics.agents.labels(name, text).inc(count)
+            self._metrics.agents.labels(name, FORECAST_STATUSES[status]).inc(count)
 
     def _count_warnings(self, response: pb.PredictResponse) -> None:
         for forecast in response.forecasts:

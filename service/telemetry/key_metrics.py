@@ -4,7 +4,11 @@ from collections.abc import Collection
 
 from prometheus_client import CollectorRegistry, Counter
 
+from service.errors import TABLE
+
 _REASONS = ("limit", "scope")
+_CODES = {"OK", "CANCELLED", *(row.code for row in TABLE)} - {"UNAUTHENTICATED", "UNIMPLEMENTED"}
+"""Codes that calls of a key that was accepted, at an address that there is, can end with."""
 
 
 class KeyMetrics:
@@ -33,8 +37,8 @@ class KeyMetrics:
 
     def add(self, name: str) -> None:
         """Begin the counters of a key at 0: rate() and increase() would miss the first event otherwise."""
-        self._codes.setdefault(name, {"OK"})
-        self.requests.labels(name, "OK")
+        for code in self._codes.setdefault(name, set(_CODES)):
+            self.requests.labels(name, code)
         self.agents.labels(name)
         for reason in _REASONS:
             self.refused.labels(name, reason)

@@ -1,5 +1,6 @@
 """Prometheus metrics. Each server object has its own registry, so that one process can run several."""
 
+import dataclasses
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from time import perf_counter
@@ -15,10 +16,16 @@ from prometheus_client import (
     generate_latest,
 )
 
+from cab.forecast.v1.prediction_service_pb2 import ForecastStatus
 from model.forecaster import ModelInfo, Protocol
+from service.telemetry.build import Build
 from service.telemetry.key_metrics import KeyMetrics
 
 _SECONDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+FORECAST_STATUSES = {
+    number: name.removeprefix("FORECAST_STATUS_").lower() for name, number in ForecastStatus.items() if number
+}
+"""Names of the statuses of agents, as metrics give them, by number."""
 _AGENTS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
 
 
@@ -34,6 +41,12 @@ class Metrics:
             "forecast_requests_total",
             "Calls by transport, method and canonical status code.",
             ["transport", "method", "code"],
+            registry=self.registry,
+        )
+        self.build = Gauge(
+            "forecast_build_info",
+            "1, with the versions of the server and of what it runs on.",
+            [field.name for field in dataclasses.fields(Build)],
             registry=self.registry,
         )
         self.request_duration = Histogram(
@@ -191,11 +204,23 @@ class Metrics:
             self.model_info.labels(info.name, info.version, info.protocol.value, is_default).set(1)
             # Start at 0: rate() and increase() would miss the first event of a series that begins with it
             self.nonfinite.labels(info.name)
+            self.off_road.labels(info.name)
+            for status in FORECAST_STATUSES.values():
+                self.agents.labels(info.name, status)
         for info in _by_name(infos, default).values():
             for seconds in range(1, int(info.horizon) + 1):
                 error_m = info.benchmark.get(f"fde_ml_{seconds}s_m")
                 if error_m is not None:
                     self.benchmark.labels(info.name, f"{seconds}").set(error_m)
+
+    def set_build(self, build: Build) -> None:
+        """Set the metric of the build."""
+        self.build.labels(**dataclasses.asdict(build)).set(1)
+
+    def begin_calls(self, transport: str, method: str, codes: Iterable[str]) -> None:
+        """Start the counters of a method at 0, for each code that its calls can end with."""
+        for code in codes:
+            self.requests.labels(transport, method, code)
 
     def begin_input_warnings(self, codes: Iterable[str]) -> None:
         """Start the counters of warnings of the input at 0, for each code."""

@@ -11,8 +11,10 @@ from model.arrays import Floats
 from model.metrics.consistency import RANGES_M
 from service.tracking.aggregates import CONVERGENCES, DISPERSIONS, ERRORS, Aggregates, ModelAggregate
 from service.tracking.metrics import AGES_S
+from service.tracking.store.failures import FailureReason
 
 _STORE_SECONDS = (0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
+_STORE_OPS = ("ping", "exchange", "read", "reset", "publish", "raster_get", "raster_put", "raster_touch")
 _METERS = np.array([0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 3.0, 5.0, 7.0, 10.0, 15.0, 20.0, 30.0, 50.0])
 _CONVERGENCE_SECONDS = np.append(0.0, AGES_S)
 
@@ -38,6 +40,9 @@ class StoreMetrics:
             ["op", "reason"],
             registry=registry,
         )
+        for op in _STORE_OPS:
+            for reason in FailureReason:
+                self._errors.labels(op, reason)
 
     def observe(self, op: str, seconds: float) -> None:
         """Record the duration of a call."""

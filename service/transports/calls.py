@@ -13,10 +13,12 @@ from cab.forecast.v1.routes import (
     GET_AGENT_CONSISTENCY,
     GET_MODEL,
     GET_SCENE_CONSISTENCY,
+    GET_VERSION,
     LIST_MODEL_CONSISTENCY,
     LIST_MODELS,
     RELOAD_MODELS,
     RESET_SCENE,
+    ROUTES,
     Route,
 )
 from service.access.caller import Caller
@@ -25,6 +27,7 @@ from service.predict.dataplane import DataPlane
 from service.settings import Settings
 from service.telemetry.metrics import Call, Metrics
 from service.telemetry.request_ids import current_request_id
+from service.transports.method_errors import codes
 
 _log = structlog.get_logger(__name__)
 _Message = TypeVar("_Message", bound=Message)
@@ -33,6 +36,7 @@ _Message = TypeVar("_Message", bound=Message)
 UNARY_METHODS: Mapping[Route[Any, Any], Callable[[DataPlane, Any], Awaitable[Message]]] = {
     LIST_MODELS: lambda dataplane, request: dataplane.list_models(request),
     GET_MODEL: lambda dataplane, request: dataplane.get_model(request),
+    GET_VERSION: lambda dataplane, request: dataplane.get_version(request),
     GET_AGENT_CONSISTENCY: lambda dataplane, request: dataplane.consistency.get_agent(request),
     GET_SCENE_CONSISTENCY: lambda dataplane, request: dataplane.consistency.get_scene(request),
     LIST_MODEL_CONSISTENCY: lambda dataplane, request: dataplane.consistency.list_models(request),
@@ -104,6 +108,8 @@ class CallRecords:
         self._transport = transport
         self._metrics = metrics
         self._share = settings.access_log
+        for route in ROUTES:
+            metrics.begin_calls(transport, route.method, codes(transport, route))
 
     @contextmanager
     def record(self, method: str, *, timed: bool = True) -> Iterator[CallRecorder]:

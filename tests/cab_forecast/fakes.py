@@ -20,6 +20,8 @@ from grpc_status import rpc_status
 from cab.forecast.v1.model_service_pb2 import (
     GetModelRequest,
     GetModelResponse,
+    GetVersionRequest,
+    GetVersionResponse,
     ListModelsRequest,
     ListModelsResponse,
     Model,
@@ -132,6 +134,9 @@ class _GrpcFake(PredictionServiceServicer, ModelServiceServicer):
 
     def ListModels(self, request: ListModelsRequest, context: Any) -> ListModelsResponse:  # noqa: N802
         return self._answer(context, lambda: ListModelsResponse(models=MODELS))
+
+    def GetVersion(self, request: GetVersionRequest, context: Any) -> GetVersionResponse:  # noqa: N802
+        return self._answer(context, GetVersionResponse)
 
     def GetModel(self, request: GetModelRequest, context: Any) -> GetModelResponse:  # noqa: N802
         return self._answer(context, lambda: self.script.get_model(request.name))

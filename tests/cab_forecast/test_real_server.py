@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Iterator
+from importlib import metadata
 from typing import Any
 
 import numpy as np
@@ -39,6 +40,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
         default_model=MODEL,
         max_batch_agents=32,
         api_tokens=(SecretStr(TOKEN),),
+        revision="abc123",
     )
     with in_thread(settings) as running:
         yield running
@@ -51,6 +53,14 @@ def arguments(request: pytest.FixtureRequest, server: Server) -> dict[str, Any]:
         return {"endpoint": f"grpc://{server.grpc_address}", "token": TOKEN}
     encoding = "json" if request.param == "http-json" else "protobuf"
     return {"endpoint": f"http://{server.http_address}", "token": TOKEN, "encoding": encoding}
+
+
+def test_tells_its_version(arguments: dict[str, Any]) -> None:
+    with Client(**arguments) as client:
+        told = client.get_version()
+    assert (told.version, told.contract) == (metadata.version("cab-forecast"), "cab.forecast.v1")
+    assert told.revision == "abc123"
+    assert told.torch == metadata.version("torch")
 
 
 def test_errors_name_the_request(arguments: dict[str, Any]) -> None:

@@ -42,7 +42,9 @@ class SharedRasters:
         """Seconds without a use after which a raster is dropped."""
         self._client = client
         self._max_bytes = max_bytes
-        self._guard = Guard(metrics.observe, metrics.failed, max_outstanding=2 * _MAX_OUTSTANDING)
+        self._guard = Guard(
+            metrics.observe, metrics.failed, calls="rasters", max_outstanding=2 * _MAX_OUTSTANDING
+        )
         self._script = Script("use.lua", _PACKAGE)
         self._writing: set[asyncio.Task[None]] = set()
 

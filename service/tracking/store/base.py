@@ -173,6 +173,13 @@ class TrackStore(ABC):
             StoreError: the store is unavailable.
         """
 
+    async def ping(self) -> None:  # noqa: B027 - a store in the process always answers
+        """Ask for a sign of life.
+
+        Raises:
+            StoreError: the store is unavailable.
+        """
+
     @abstractmethod
     async def close(self) -> None:
         """Release all resources."""

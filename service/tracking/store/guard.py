@@ -6,6 +6,7 @@ It keeps a slow or broken track memory from delaying forecasts.
 import asyncio
 import time
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -13,6 +14,7 @@ import structlog
 
 from service.tracking.store.base import StoreError
 from service.tracking.store.failures import FailureReason, reason_of, store_error
+from service.tracking.store.outage import Outage
 
 _log = structlog.get_logger(__name__)
 
@@ -22,6 +24,8 @@ _HEALTHY = (FailureReason.OUT_OF_MEMORY, FailureReason.READONLY)
 """Refusals that Redis sends at once; they do not open the circuit."""
 _TASK_TIMEOUT = 30.0
 """Seconds after which a call is cancelled; unless there is a bug, its own timeouts come long before."""
+_CHECK_SECONDS = 1.0
+"""Seconds in which the store must answer when the server starts."""
 _LOOP_PASSES = 4
 """Passes of the event loop between the arrival of a reply and the end of the call."""
 
@@ -48,6 +52,11 @@ class CircuitBreaker:
         self._pause = pause_s
         self._open_until: float | None = None
         self._probing = False
+
+    @property
+    def is_open(self) -> bool:
+        """True from the failures that open the circuit to the success of a probe."""
+        return self._open_until is not None
 
     @property
     def ready(self) -> bool:
@@ -106,6 +115,7 @@ class Guard:
         observe: Callable[[str, float], None],
         failed: Callable[[str, str], None],
         *,
+        calls: str = "all",
         max_outstanding: int = 64,
         failures: int = 3,
         pause_s: float = 0.25,
@@ -117,6 +127,7 @@ class Guard:
             observe: called with the operation and the duration in seconds at the end of each call.
             failed: called with the operation and the ``FailureReason`` of each call that failed or was
                 refused.
+            calls: the kind of calls, for the log.
             max_outstanding: calls in progress at most, including those that nobody waits for.
             failures: failures in a row that open the circuit.
             pause_s: seconds of the circuit breaker's first pause; it doubles after each failed probe.
@@ -127,6 +138,7 @@ class Guard:
         self._failed = failed
         self._max_outstanding = max_outstanding
         self._circuit = CircuitBreaker(failures, pause_s, max_pause_s, clock)
+        self._outage = Outage(calls, failures)
         self._outstanding: set[asyncio.Task[Any]] = set()
         self._closed = False
 
@@ -174,6 +186,12 @@ class Guard:
             self._abandon(attempt, task, late)
             raise store_error(FailureReason.TIMEOUT)
         return self._result(attempt, task)
+
+    async def check(self, call: Callable[[], Awaitable[None]]) -> None:
+        """Make a first call, and log at once if it fails."""
+        self._outage.suspect()
+        with suppress(StoreError):
+            await self.run("ping", call, _CHECK_SECONDS)
 
     async def close(self, wait_s: float = 0.0) -> None:
         """Cancel the calls in progress and refuse new ones.
@@ -262,6 +280,9 @@ class Guard:
         self._circuit.end(attempt.probe, reason is None or reason in _HEALTHY)
         if reason is not None:
             self._failed(attempt.op, reason)
+            self._outage.failed(reason, circuit_open=self._circuit.is_open)
+        elif not self._circuit.is_open:  # a call from before the circuit opened decides nothing
+            self._outage.succeeded()
 
 
 async def _wait(task: asyncio.Task[Any], budget_s: float) -> None:

@@ -8,11 +8,7 @@ from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1.bounds import STEP_SECONDS
 from cab.forecast.v1.routes import (
-    GET_AGENT_CONSISTENCY,
     GET_MODEL,
-    GET_SCENE_CONSISTENCY,
-    LIST_MODEL_CONSISTENCY,
-    LIST_MODELS,
     PREDICT,
     RELOAD_MODELS,
     RESET_SCENE,
@@ -20,29 +16,9 @@ from cab.forecast.v1.routes import (
     WATCH_SCENE,
     Route,
 )
-from service.errors import (
-    BadFields,
-    DeadlineExceeded,
-    Internal,
-    LimitExceeded,
-    MethodNotAllowed,
-    NotAcceptable,
-    NotFound,
-    Overloaded,
-    PermissionDenied,
-    ReloadRefused,
-    RequestTimeout,
-    ServiceError,
-    TooLarge,
-    TrackingUnavailable,
-    Unauthenticated,
-    Unavailable,
-    UnknownModel,
-    UnknownRaster,
-    UnknownTrack,
-    UnsupportedMediaType,
-)
+from service.errors import ServiceError, Unavailable
 from service.settings import Settings
+from service.transports.method_errors import ACCESS, RETRYABLE, Errors, rest_errors
 from service.transports.rest.codec import to_json
 from service.transports.rest.negotiation import EVENT_STREAM, TIMEOUT_HEADER, Format
 from service.transports.rest.problem import MEDIA_TYPE
@@ -54,40 +30,6 @@ The messages are those of the gRPC contract (`cab.forecast.v1`) as JSON by proto
 `application/x-protobuf`. Field names are read in snake_case and camelCase and written in snake_case.
 Errors are `application/problem+json` (RFC 9457), with a machine-readable `reason`."""
 
-_Errors = tuple[type[ServiceError], ...]
-
-_ACCESS: _Errors = (Unauthenticated, PermissionDenied, LimitExceeded)
-"""Errors of callers without a key, without the scope, and beyond the limits of their key."""
-_ALL_METHODS: _Errors = (*_ACCESS, NotAcceptable, Overloaded, Unavailable, Internal)
-"""Errors that every method can return."""
-_ERRORS: dict[Route[Any, Any], _Errors] = {
-    PREDICT: (
-        BadFields,
-        UnknownModel,
-        UnknownRaster,
-        TooLarge,
-        UnsupportedMediaType,
-        RequestTimeout,
-        DeadlineExceeded,
-    ),
-    LIST_MODELS: (),
-    GET_MODEL: (UnknownModel, NotFound, MethodNotAllowed),
-    GET_AGENT_CONSISTENCY: (BadFields, UnknownTrack, TrackingUnavailable),
-    GET_SCENE_CONSISTENCY: (BadFields, UnknownTrack, TrackingUnavailable),
-    LIST_MODEL_CONSISTENCY: (BadFields,),
-    WATCH_SCENE: (BadFields, TrackingUnavailable),
-    RESET_SCENE: (BadFields, TooLarge, UnsupportedMediaType, RequestTimeout, TrackingUnavailable),
-    RELOAD_MODELS: (
-        BadFields,
-        TooLarge,
-        UnsupportedMediaType,
-        RequestTimeout,
-        PermissionDenied,
-        ReloadRefused,
-    ),
-}
-"""Further errors of each method."""
-_RETRYABLE = (LimitExceeded, Overloaded, Unavailable, TrackingUnavailable)
 _BINARY = {"schema": {"type": "string", "format": "binary"}}
 
 _NOW = 1_700_000_000.0
@@ -107,7 +49,7 @@ def openapi_document(settings: Settings, *, closed: bool = False) -> dict[str, A
         route.path: {route.verb.lower(): _operation(route, settings)} for route in ROUTES
     }
     paths |= {
-        "/metrics": {"get": _probe("metrics", "Metrics in the Prometheus text format.", *_ACCESS)},
+        "/metrics": {"get": _probe("metrics", "Metrics in the Prometheus text format.", *ACCESS)},
     }
     if closed:
         for operations in paths.values():
@@ -148,7 +90,7 @@ def _operation(route: Route[Any, Any], settings: Settings) -> Schema:
         "description": text,
         "responses": {
             "200": {"description": "The response.", "content": content},
-            **_problems((*_ALL_METHODS, *_ERRORS[route])),
+            **_problems(rest_errors(route)),
         },
     }
     parameters = _parameters(route, settings)
@@ -267,7 +209,7 @@ def _problem_schema() -> Schema:
     }
 
 
-def _problems(errors: _Errors) -> dict[str, Schema]:
+def _problems(errors: Errors) -> dict[str, Schema]:
     """Return responses by HTTP status; errors with the same status share one."""
     responses: dict[str, Schema] = {}
     for error in sorted(errors, key=lambda row: row.http_status):
@@ -277,7 +219,7 @@ def _problems(errors: _Errors) -> dict[str, Schema]:
             {"description": "", "content": {MEDIA_TYPE: {"schema": reference("Problem")}}},
         )
         response["description"] = f"{response['description']} {text}".strip()
-        if error in _RETRYABLE:
+        if error in RETRYABLE:
             response["headers"] = {
                 "Retry-After": {
                     "description": "Seconds to wait before a retry.",

@@ -1,9 +1,13 @@
 """Exported metrics."""
 
+from collections.abc import Mapping
+from importlib import metadata
+
 import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from cab.forecast.v1.routes import ROUTES
 from model.baselines import kalman
 from model.forecaster import ModelInfo, Protocol
 from service.server import Server
@@ -13,9 +17,11 @@ from tests.service.requests import CYCLIST, add_agent, make_request
 from tests.service.servers import CallError, call_grpc, call_rest, running
 
 
-async def scrape(server: Server) -> dict[tuple[str, frozenset[str]], float]:
+async def scrape(
+    server: Server, headers: Mapping[str, str] | None = None
+) -> dict[tuple[str, frozenset[str]], float]:
     async with httpx.AsyncClient() as client:
-        text = (await client.get(f"http://{server.http_address}/metrics")).text
+        text = (await client.get(f"http://{server.http_address}/metrics", headers=headers)).text
     return {
         (sample.name, frozenset(sample.labels.values())): sample.value
         for family in text_string_to_metric_families(text)
@@ -66,7 +72,7 @@ async def test_servers_do_not_share_metrics() -> None:
         await call_grpc(one, make_request(1))
         name, labels = "forecast_requests_total", {"transport": "grpc", "method": "Predict", "code": "OK"}
         assert one.metrics.registry.get_sample_value(name, labels) == 1
-        assert other.metrics.registry.get_sample_value(name, labels) is None
+        assert other.metrics.registry.get_sample_value(name, labels) == 0
 
 
 def test_the_benchmark_is_of_the_version_that_a_name_means() -> None:
@@ -101,3 +107,57 @@ def test_what_never_happened_is_counted_as_0() -> None:
     fake = FakeForecaster().info
     metrics.set_models([fake], fake)
     assert metrics.registry.get_sample_value("forecast_nonfinite_total", {"model": "fake"}) == 0
+
+
+async def test_calls_are_counted_from_0_for_each_code() -> None:
+    async with running(FakeForecaster()) as server:
+        families = text_string_to_metric_families(server.metrics.render().decode())
+    [requests] = [family for family in families if family.name == "forecast_requests"]
+    totals = {
+        (sample.labels["transport"], sample.labels["method"], sample.labels["code"]): sample.value
+        for sample in requests.samples
+        if sample.name == "forecast_requests_total"
+    }
+    assert set(totals.values()) == {0.0}
+    assert {(transport, method) for transport, method, _ in totals} == {
+        (transport, route.method) for transport in ("grpc", "rest") for route in ROUTES
+    }
+    for transport in ("grpc", "rest"):
+        assert {code for *call, code in totals if call == [transport, "Predict"]} == {
+            "OK",
+            "CANCELLED",
+            "DEADLINE_EXCEEDED",
+            "FAILED_PRECONDITION",
+            "INTERNAL",
+            "INVALID_ARGUMENT",
+            "NOT_FOUND",
+            "PERMISSION_DENIED",
+            "RESOURCE_EXHAUSTED",
+            "UNAUTHENTICATED",
+            "UNAVAILABLE",
+        }
+    assert ("rest", "ListModels", "NOT_FOUND") not in totals
+
+
+async def test_agents_keys_and_store_errors_are_counted_from_0() -> None:
+    async with running(FakeForecaster(), api_tokens=("right",)) as server:
+        seen = await scrape(server, {"authorization": "Bearer right"})
+    for status in ("ok", "short_history", "fallback", "invalid"):
+        assert seen["forecast_agents_total", frozenset({"fake", status})] == 0
+    assert seen["forecast_off_road_total", frozenset({"fake"})] == 0
+    assert seen["forecast_key_requests_total", frozenset({"(api_tokens)", "INTERNAL"})] == 0
+    assert seen["forecast_track_store_errors_total", frozenset({"exchange", "timeout"})] == 0
+
+
+async def test_the_build_is_told() -> None:
+    async with running(revision="abc123") as server:
+        [family] = [
+            family
+            for family in text_string_to_metric_families(server.metrics.render().decode())
+            if family.name == "forecast_build_info"
+        ]
+    [sample] = family.samples
+    assert sample.value == 1
+    assert sample.labels["version"] == metadata.version("cab-forecast")
+    assert sample.labels["revision"] == "abc123"
+    assert sample.labels["torch"] == metadata.version("torch")

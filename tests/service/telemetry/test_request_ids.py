@@ -1,6 +1,7 @@
 """Choice of request ids."""
 
 import re
+from contextvars import copy_context
 
 import pytest
 import structlog
@@ -43,7 +44,10 @@ def test_only_valid_traces_are_taken_over(traceparent: str, trace_id: str) -> No
 
 
 def test_log_lines_hold_the_ids_of_the_last_request() -> None:
-    begin(ids_of("first", PARENT))
-    begin(ids_of("second", None))
-    assert current_request_id() == "second"
-    assert structlog.contextvars.get_contextvars() == {"request_id": "second"}
+    def check() -> None:
+        begin(ids_of("first", PARENT))
+        begin(ids_of("second", None))
+        assert current_request_id() == "second"
+        assert structlog.contextvars.get_contextvars() == {"request_id": "second"}
+
+    copy_context().run(check)

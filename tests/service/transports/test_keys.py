@@ -155,11 +155,13 @@ async def test_agents_in_progress_are_for_one_key_alone(transport: str, file: Pa
             429,
             "LIMIT_EXCEEDED",
         )
+        greedy = server.access.gate.identify(held_by("greedy")["authorization"])
+        await until(lambda: greedy._usage.agents == 2)  # a refused call counts until its error was sent
         too_large = await failure(predict(server, make_request(4), held_by("greedy")))
         check(too_large, "RESOURCE_EXHAUSTED", 413, "TOO_LARGE")
+        await until(lambda: greedy._usage.agents == 2)
         second = asyncio.create_task(predict(server, make_request(1), held_by("greedy")))
-        greedy = server.access.gate.identify(held_by("greedy")["authorization"])
-        await until(lambda: greedy._usage.agents == 3)  # and those that were refused are gone
+        await until(lambda: greedy._usage.agents == 3)
         for _ in range(10):  # refused on arrival, these take no place of the others
             check(
                 await failure(predict(server, b"no message", held_by("greedy"))),

@@ -24,7 +24,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n#cab/forecast/v1/model_service.proto\x12\x0f\x63\x61\x62.forecast.v1\"a\n\x0eModelReference\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0f\n\x07version\x18\x02 \x01(\t\x12\x30\n\x08protocol\x18\x03 \x01(\x0e\x32\x1e.cab.forecast.v1.InputProtocol\"\xfe\x03\n\x05Model\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0f\n\x07version\x18\x02 \x01(\t\x12\x30\n\x08protocol\x18\x03 \x01(\x0e\x32\x1e.cab.forecast.v1.InputProtocol\x12\x12\n\nis_default\x18\x04 \x01(\x08\x12\x13\n\x0b\x64\x65scription\x18\x05 \x01(\t\x12/\n\x0b\x61gent_types\x18\x06 \x03(\x0e\x32\x1a.cab.forecast.v1.AgentType\x12\x31\n\rcontext_types\x18\x07 \x03(\x0e\x32\x1a.cab.forecast.v1.AgentType\x12\x0f\n\x07horizon\x18\x08 \x01(\x01\x12\x0c\n\x04step\x18\t \x01(\x01\x12\x16\n\x0ehistory_frames\x18\n \x01(\r\x12\r\n\x05modes\x18\x0b \x01(\r\x12\x10\n\x08uses_map\x18\x0c \x01(\x08\x12\x16\n\x0euses_neighbors\x18\r \x01(\x08\x12\x12\n\ntrained_on\x18\x0e \x01(\t\x12\x38\n\tbenchmark\x18\x0f \x03(\x0b\x32%.cab.forecast.v1.Model.BenchmarkEntry\x12\x0f\n\x07license\x18\x10 \x01(\t\x12\x16\n\x0esupports_blind\x18\x11 \x01(\x08\x1a\x30\n\x0e\x42\x65nchmarkEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x01:\x02\x38\x01\"\x13\n\x11ListModelsRequest\"<\n\x12ListModelsResponse\x12&\n\x06models\x18\x01 \x03(\x0b\x32\x16.cab.forecast.v1.Model\"\x1f\n\x0fGetModelRequest\x12\x0c\n\x04name\x18\x01 \x01(\t\"9\n\x10GetModelResponse\x12%\n\x05model\x18\x01 \x01(\x0b\x32\x16.cab.forecast.v1.Model*\x8a\x01\n\tAgentType\x12\x1a\n\x16\x41GENT_TYPE_UNSPECIFIED\x10\x00\x12\x16\n\x12\x41GENT_TYPE_VEHICLE\x10\x01\x12\x19\n\x15\x41GENT_TYPE_PEDESTRIAN\x10\x02\x12\x16\n\x12\x41GENT_TYPE_CYCLIST\x10\x03\x12\x16\n\x12\x41GENT_TYPE_UNKNOWN\x10\x04*d\n\rInputProtocol\x12\x1e\n\x1aINPUT_PROTOCOL_UNSPECIFIED\x10\x00\x12\x19\n\x15INPUT_PROTOCOL_CAUSAL\x10\x01\x12\x18\n\x14INPUT_PROTOCOL_PAPER\x10\x02\x32\xb6\x01\n\x0cModelService\x12U\n\nListModels\x12\".cab.forecast.v1.ListModelsRequest\x1a#.cab.forecast.v1.ListModelsResponse\x12O\n\x08GetModel\x12 .cab.forecast.v1.GetModelRequest\x1a!.cab.forecast.v1.GetModelResponseb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n#cab/forecast/v1/model_service.proto\x12\x0f\x63\x61\x62.forecast.v1\"a\n\x0eModelReference\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0f\n\x07version\x18\x02 \x01(\t\x12\x30\n\x08protocol\x18\x03 \x01(\x0e\x32\x1e.cab.forecast.v1.InputProtocol\"\xfe\x03\n\x05Model\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0f\n\x07version\x18\x02 \x01(\t\x12\x30\n\x08protocol\x18\x03 \x01(\x0e\x32\x1e.cab.forecast.v1.InputProtocol\x12\x12\n\nis_default\x18\x04 \x01(\x08\x12\x13\n\x0b\x64\x65scription\x18\x05 \x01(\t\x12/\n\x0b\x61gent_types\x18\x06 \x03(\x0e\x32\x1a.cab.forecast.v1.AgentType\x12\x31\n\rcontext_types\x18\x07 \x03(\x0e\x32\x1a.cab.forecast.v1.AgentType\x12\x0f\n\x07horizon\x18\x08 \x01(\x01\x12\x0c\n\x04step\x18\t \x01(\x01\x12\x16\n\x0ehistory_frames\x18\n \x01(\r\x12\r\n\x05modes\x18\x0b \x01(\r\x12\x10\n\x08uses_map\x18\x0c \x01(\x08\x12\x16\n\x0euses_neighbors\x18\r \x01(\x08\x12\x12\n\ntrained_on\x18\x0e \x01(\t\x12\x38\n\tbenchmark\x18\x0f \x03(\x0b\x32%.cab.forecast.v1.Model.BenchmarkEntry\x12\x0f\n\x07license\x18\x10 \x01(\t\x12\x16\n\x0esupports_blind\x18\x11 \x01(\x08\x1a\x30\n\x0e\x42\x65nchmarkEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x01:\x02\x38\x01\"\x13\n\x11ListModelsRequest\"<\n\x12ListModelsResponse\x12&\n\x06models\x18\x01 \x03(\x0b\x32\x16.cab.forecast.v1.Model\"\x1f\n\x0fGetModelRequest\x12\x0c\n\x04name\x18\x01 \x01(\t\"9\n\x10GetModelResponse\x12%\n\x05model\x18\x01 \x01(\x0b\x32\x16.cab.forecast.v1.Model\"\x13\n\x11GetVersionRequest\"}\n\x12GetVersionResponse\x12\x0f\n\x07version\x18\x01 \x01(\t\x12\x10\n\x08revision\x18\x02 \x01(\t\x12\x10\n\x08\x63ontract\x18\x03 \x01(\t\x12\x0e\n\x06python\x18\x04 \x01(\t\x12\r\n\x05torch\x18\x05 \x01(\t\x12\x13\n\x0bonnxruntime\x18\x06 \x01(\t*\x8a\x01\n\tAgentType\x12\x1a\n\x16\x41GENT_TYPE_UNSPECIFIED\x10\x00\x12\x16\n\x12\x41GENT_TYPE_VEHICLE\x10\x01\x12\x19\n\x15\x41GENT_TYPE_PEDESTRIAN\x10\x02\x12\x16\n\x12\x41GENT_TYPE_CYCLIST\x10\x03\x12\x16\n\x12\x41GENT_TYPE_UNKNOWN\x10\x04*d\n\rInputProtocol\x12\x1e\n\x1aINPUT_PROTOCOL_UNSPECIFIED\x10\x00\x12\x19\n\x15INPUT_PROTOCOL_CAUSAL\x10\x01\x12\x18\n\x14INPUT_PROTOCOL_PAPER\x10\x02\x32\x8d\x02\n\x0cModelService\x12U\n\nListModels\x12\".cab.forecast.v1.ListModelsRequest\x1a#.cab.forecast.v1.ListModelsResponse\x12O\n\x08GetModel\x12 .cab.forecast.v1.GetModelRequest\x1a!.cab.forecast.v1.GetModelResponse\x12U\n\nGetVersion\x12\".cab.forecast.v1.GetVersionRequest\x1a#.cab.forecast.v1.GetVersionResponseb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -33,10 +33,10 @@ if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_MODEL_BENCHMARKENTRY']._loaded_options = None
   _globals['_MODEL_BENCHMARKENTRY']._serialized_options = b'8\001'
-  _globals['_AGENTTYPE']._serialized_start=844
-  _globals['_AGENTTYPE']._serialized_end=982
-  _globals['_INPUTPROTOCOL']._serialized_start=984
-  _globals['_INPUTPROTOCOL']._serialized_end=1084
+  _globals['_AGENTTYPE']._serialized_start=992
+  _globals['_AGENTTYPE']._serialized_end=1130
+  _globals['_INPUTPROTOCOL']._serialized_start=1132
+  _globals['_INPUTPROTOCOL']._serialized_end=1232
   _globals['_MODELREFERENCE']._serialized_start=56
   _globals['_MODELREFERENCE']._serialized_end=153
   _globals['_MODEL']._serialized_start=156
@@ -51,6 +51,10 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_GETMODELREQUEST']._serialized_end=782
   _globals['_GETMODELRESPONSE']._serialized_start=784
   _globals['_GETMODELRESPONSE']._serialized_end=841
-  _globals['_MODELSERVICE']._serialized_start=1087
-  _globals['_MODELSERVICE']._serialized_end=1269
+  _globals['_GETVERSIONREQUEST']._serialized_start=843
+  _globals['_GETVERSIONREQUEST']._serialized_end=862
+  _globals['_GETVERSIONRESPONSE']._serialized_start=864
+  _globals['_GETVERSIONRESPONSE']._serialized_end=989
+  _globals['_MODELSERVICE']._serialized_start=1235
+  _globals['_MODELSERVICE']._serialized_end=1504
 # @@protoc_insertion_point(module_scope)

@@ -26,7 +26,7 @@ if _version_not_supported:
 
 
 class ModelServiceStub:
-    """What the server can forecast with.
+    """What the server can forecast with, and what it is.
     """
 
     def __init__(self, channel):
@@ -45,10 +45,15 @@ class ModelServiceStub:
                 request_serializer=cab_dot_forecast_dot_v1_dot_model__service__pb2.GetModelRequest.SerializeToString,
                 response_deserializer=cab_dot_forecast_dot_v1_dot_model__service__pb2.GetModelResponse.FromString,
                 _registered_method=True)
+        self.GetVersion = channel.unary_unary(
+                '/cab.forecast.v1.ModelService/GetVersion',
+                request_serializer=cab_dot_forecast_dot_v1_dot_model__service__pb2.GetVersionRequest.SerializeToString,
+                response_deserializer=cab_dot_forecast_dot_v1_dot_model__service__pb2.GetVersionResponse.FromString,
+                _registered_method=True)
 
 
 class ModelServiceServicer:
-    """What the server can forecast with.
+    """What the server can forecast with, and what it is.
     """
 
     def ListModels(self, request, context):
@@ -60,6 +65,13 @@ class ModelServiceServicer:
 
     def GetModel(self, request, context):
         """One model. NOT_FOUND when no loaded model has that name (and version).
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def GetVersion(self, request, context):
+        """Version of the server itself; also while it is starting or draining.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -78,6 +90,11 @@ def add_ModelServiceServicer_to_server(servicer, server):
                     request_deserializer=cab_dot_forecast_dot_v1_dot_model__service__pb2.GetModelRequest.FromString,
                     response_serializer=cab_dot_forecast_dot_v1_dot_model__service__pb2.GetModelResponse.SerializeToString,
             ),
+            'GetVersion': grpc.unary_unary_rpc_method_handler(
+                    servicer.GetVersion,
+                    request_deserializer=cab_dot_forecast_dot_v1_dot_model__service__pb2.GetVersionRequest.FromString,
+                    response_serializer=cab_dot_forecast_dot_v1_dot_model__service__pb2.GetVersionResponse.SerializeToString,
+            ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
             'cab.forecast.v1.ModelService', rpc_method_handlers)
@@ -87,7 +104,7 @@ def add_ModelServiceServicer_to_server(servicer, server):
 
  # This class is part of an EXPERIMENTAL API.
 class ModelService:
-    """What the server can forecast with.
+    """What the server can forecast with, and what it is.
     """
 
     @staticmethod
@@ -134,6 +151,33 @@ class ModelService:
             '/cab.forecast.v1.ModelService/GetModel',
             cab_dot_forecast_dot_v1_dot_model__service__pb2.GetModelRequest.SerializeToString,
             cab_dot_forecast_dot_v1_dot_model__service__pb2.GetModelResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def GetVersion(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/cab.forecast.v1.ModelService/GetVersion',
+            cab_dot_forecast_dot_v1_dot_model__service__pb2.GetVersionRequest.SerializeToString,
+            cab_dot_forecast_dot_v1_dot_model__service__pb2.GetVersionResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -27,7 +27,7 @@ GRPC_GENERATED_VERSION: str
 GRPC_VERSION: str
 
 class ModelServiceStub:
-    """What the server can forecast with."""
+    """What the server can forecast with, and what it is."""
 
     @_typing.overload
     def __new__(cls, channel: _grpc.Channel) -> _Self: ...
@@ -37,19 +37,23 @@ class ModelServiceStub:
     """Every model that is loaded, sorted by name, then by version (oldest first)."""
     GetModel: _grpc.UnaryUnaryMultiCallable[_model_service_pb2.GetModelRequest, _model_service_pb2.GetModelResponse]
     """One model. NOT_FOUND when no loaded model has that name (and version)."""
+    GetVersion: _grpc.UnaryUnaryMultiCallable[_model_service_pb2.GetVersionRequest, _model_service_pb2.GetVersionResponse]
+    """Version of the server itself; also while it is starting or draining."""
 
 @_typing.type_check_only
 class ModelServiceAsyncStub(ModelServiceStub):
-    """What the server can forecast with."""
+    """What the server can forecast with, and what it is."""
 
     def __init__(self, channel: _aio.Channel) -> None: ...
     ListModels: _aio.UnaryUnaryMultiCallable[_model_service_pb2.ListModelsRequest, _model_service_pb2.ListModelsResponse]  # type: ignore[assignment]
     """Every model that is loaded, sorted by name, then by version (oldest first)."""
     GetModel: _aio.UnaryUnaryMultiCallable[_model_service_pb2.GetModelRequest, _model_service_pb2.GetModelResponse]  # type: ignore[assignment]
     """One model. NOT_FOUND when no loaded model has that name (and version)."""
+    GetVersion: _aio.UnaryUnaryMultiCallable[_model_service_pb2.GetVersionRequest, _model_service_pb2.GetVersionResponse]  # type: ignore[assignment]
+    """Version of the server itself; also while it is starting or draining."""
 
 class ModelServiceServicer(metaclass=_abc_1.ABCMeta):
-    """What the server can forecast with."""
+    """What the server can forecast with, and what it is."""
 
     @_abc_1.abstractmethod
     def ListModels(
@@ -66,5 +70,13 @@ class ModelServiceServicer(metaclass=_abc_1.ABCMeta):
         context: _ServicerContext,
     ) -> _typing.Union[_model_service_pb2.GetModelResponse, _abc.Awaitable[_model_service_pb2.GetModelResponse]]:
         """One model. NOT_FOUND when no loaded model has that name (and version)."""
+
+    @_abc_1.abstractmethod
+    def GetVersion(
+        self,
+        request: _model_service_pb2.GetVersionRequest,
+        context: _ServicerContext,
+    ) -> _typing.Union[_model_service_pb2.GetVersionResponse, _abc.Awaitable[_model_service_pb2.GetVersionResponse]]:
+        """Version of the server itself; also while it is starting or draining."""
 
 def add_ModelServiceServicer_to_server(servicer: ModelServiceServicer, server: _typing.Union[_grpc.Server, _aio.Server]) -> None: ...

@@ -27,6 +27,8 @@ from cab.forecast.v1.consistency_service_pb2 import (
 from cab.forecast.v1.model_service_pb2 import (
     GetModelRequest,
     GetModelResponse,
+    GetVersionRequest,
+    GetVersionResponse,
     ListModelsRequest,
     ListModelsResponse,
 )
@@ -89,6 +91,9 @@ LIST_MODELS: Route[ListModelsRequest, ListModelsResponse] = Route(
 GET_MODEL: Route[GetModelRequest, GetModelResponse] = Route(
     MODEL_SERVICE, "GetModel", "GET", "/v1/models/{name}", GetModelRequest, GetModelResponse
 )
+GET_VERSION: Route[GetVersionRequest, GetVersionResponse] = Route(
+    MODEL_SERVICE, "GetVersion", "GET", "/v1/version", GetVersionRequest, GetVersionResponse
+)
 GET_AGENT_CONSISTENCY: Route[GetAgentConsistencyRequest, GetAgentConsistencyResponse] = Route(
     CONSISTENCY_SERVICE,
     "GetAgentConsistency",
@@ -143,6 +148,7 @@ ROUTES: tuple[Route[Any, Any], ...] = (
     PREDICT,
     LIST_MODELS,
     GET_MODEL,
+    GET_VERSION,
     GET_AGENT_CONSISTENCY,
     GET_SCENE_CONSISTENCY,
     LIST_MODEL_CONSISTENCY,

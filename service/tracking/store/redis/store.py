@@ -159,6 +159,9 @@ class RedisStore(TrackStore):
             scene.clear()
             return agents
 
+    async def ping(self) -> None:
+        await self._client.ping()
+
     async def publish(self, scene_id: str, events: Sequence[bytes]) -> None:
         keys = SceneKeys(scene_id)
         packed = b"".join(_LENGTH.pack(len(event)) + event for event in events)

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from redis import exceptions as redis_errors
+from structlog.testing import capture_logs
 
 from loadtest.redis_servers import FaultProxy
 from service.redis_url import parse_address
@@ -426,3 +427,64 @@ def test_calls_from_before_it_opened_decide_nothing(circuit: CircuitBreaker, clo
     circuit.end(old[5], True)
     assert probe
     assert not circuit.ready
+
+
+async def test_an_outage_is_logged_once_and_so_is_its_end() -> None:
+    watched = Watched(calls="forecasts")
+    with capture_logs() as logs:
+        for _ in range(2):
+            await watched.fail()
+        assert logs == []  # one lost reply is no outage
+        for _ in range(3):
+            await watched.fail()
+        for _ in range(3):  # failed probes
+            watched.now += 10.0
+            await watched.fail()
+        [lost] = logs
+        watched.now += 10.0
+        for _ in range(3):
+            await watched.guard.run("read", answer, LONG)
+        _, back = logs
+    assert lost == {
+        "event": "track memory lost",
+        "log_level": "warning",
+        "calls": "forecasts",
+        "reason": "refused",
+        "circuit_open": True,
+    }
+    assert (back["event"], back["log_level"]) == ("track memory back", "warning")
+    assert back["seconds"] >= 0
+
+
+async def test_a_full_memory_is_an_outage_that_opens_no_circuit() -> None:
+    watched = Watched()
+    with capture_logs() as logs:
+        for _ in range(6):
+            await watched.fail(redis_errors.OutOfMemoryError())
+        [lost] = logs
+        await watched.guard.run("read", answer, LONG)
+    assert (lost["reason"], lost["circuit_open"]) == ("out_of_memory", False)
+    assert [entry["event"] for entry in logs] == ["track memory lost", "track memory back"]
+
+
+async def test_the_first_check_is_logged_at_once() -> None:
+    async def refuse() -> None:
+        raise redis_errors.ConnectionError
+
+    watched = Watched()
+    with capture_logs() as logs:
+        await watched.guard.check(refuse)
+        await watched.fail()
+    assert [entry["event"] for entry in logs] == ["track memory lost"]
+
+
+async def test_a_first_check_that_succeeds_is_silent() -> None:
+    async def respond() -> None:
+        pass
+
+    watched = Watched()
+    with capture_logs() as logs:
+        await watched.guard.check(respond)
+        for _ in range(2):
+            await watched.fail()
+    assert logs == []
