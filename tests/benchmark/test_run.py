@@ -309,7 +309,7 @@ def test_the_use_of_the_context_is_the_same_through_an_endpoint(
     forecasters = [*chosen.baselines, *(one.forecaster for one in chosen.learned)]
     context = ContextSettings(donors=1, no_context="constant-velocity-yaw")
     address = Endpoint(f"grpc://{server.grpc_address}", concurrency=4, timeout=30)
-    sources: tuple[Sequence[Forecaster], Endpoint] = (forecasters, address)
+    sources: list[Sequence[Forecaster] | Endpoint] = [forecasters, address]
     found = []
     for number, source in enumerate(sources):
         folder = tmp_path / str(number)
