@@ -15,7 +15,7 @@ AUDIT_FLAGS ?=
 PROTOC := PATH="$(CURDIR)/$(BIN):$$PATH" python -m grpc_tools.protoc
 PROTOS := $(wildcard proto/cab/forecast/v1/*.proto)
 
-.PHONY: install run test test-nuscenes bench loadtest peers peers-install faults lint format docs proto proto-check proto-lint audit lock clean
+.PHONY: install run test test-system test-nuscenes bench loadtest peers peers-install faults lint format docs proto proto-check proto-lint audit lock clean
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -29,6 +29,9 @@ run: install  ## serve on 127.0.0.1:8080 (REST) and 127.0.0.1:50051 (gRPC), and 
 
 test: install lint proto-check  ## lint, check types and generated code, run all tests
 	$(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist loadfile
+
+test-system: install  ## replicas behind HAProxy, scraped by Prometheus (apt-get install haproxy prometheus); needs redis-server
+	$(BIN)/python -m pytest -m system tests/system
 
 # nuscenes-devkit needs numpy < 2, so it has its own environment, with all other pins of constraints.txt.
 $(NUSCENES)/.installed: pyproject.toml constraints.txt

@@ -40,6 +40,9 @@ _OPTIONS: Sequence[tuple[str, int | str]] = (
 _BROKEN_OFF = "Socket closed"
 """Part of gRPC's message about a server that ended the connection, as one that misses a certificate does."""
 
+_BROKEN_RESPONSE = ("Stream removed", "RST_STREAM")
+"""Parts of gRPC's messages about a response that broke off, as a proxy ends it when its server is gone."""
+
 
 class GrpcTransport:
     """Blocking transport over one channel; usable from several threads."""
@@ -193,7 +196,8 @@ def error_from_call(call: grpc.RpcError, connection: Connection) -> ForecastErro
             retry_after = retry.retry_delay.ToNanoseconds() / 1e9
         else:
             detail.Unpack(request)
-    if not details and code == "UNAVAILABLE":
+    lost = code in ("UNKNOWN", "INTERNAL") and any(text in message for text in _BROKEN_RESPONSE)
+    if not details and (code == "UNAVAILABLE" or lost):
         # The server's own UNAVAILABLE has details; this one comes from the channel.
         broken_off = _BROKEN_OFF in message
         return connection_failed(
