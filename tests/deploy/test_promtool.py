@@ -10,7 +10,7 @@ from tests.deploy.files import PROMETHEUS
 
 @pytest.mark.parametrize(
     "words",
-    [("check", "config", "prometheus.yml"), ("test", "rules", "alerts_test.yml")],
+    [("check", "config", "--syntax-only", "prometheus.yml"), ("test", "rules", "alerts_test.yml")],
     ids=["configuration", "rules"],
 )
 def test_promtool_is_content(words: tuple[str, ...]) -> None:
