@@ -18,6 +18,7 @@ from service.predict.models_folder import load_models, models_folder
 from service.predict.reload import Load
 from service.settings import Settings, SettingsError, is_local
 from service.telemetry.metrics import Metrics
+from service.telemetry.tracing import TracingMissingError, make_tracing
 from service.transports.grpc.server import GrpcServer
 from service.transports.intake import Intake
 from service.transports.rest.server import HttpServer, build_app, build_probes
@@ -47,7 +48,8 @@ class Server:
             load: reads the models; default: the baselines and the checkpoints that the settings name.
 
         Raises:
-            StartError: the keys or certificates are missing or broken, or anyone could call.
+            StartError: the keys or certificates are missing or broken, anyone could call, or the packages
+                for tracing are missing.
         """
         self.settings = settings
         self.metrics = Metrics()
@@ -56,11 +58,17 @@ class Server:
             self.access = Access(settings, self.metrics)
         except SettingsError as error:
             raise StartError(str(error)) from error
+        try:
+            self._tracing = make_tracing() if settings.tracing else None
+        except TracingMissingError as error:
+            raise StartError(f"tracing: {error}") from error
         self.dataplane = DataPlane(settings, self.metrics)
         self._load = load or functools.partial(_load_models, settings)
         self.intake = Intake(settings, self.metrics)
-        self._grpc = GrpcServer(self.dataplane, self.metrics, settings, self.intake, self.access)
-        app = build_app(self.dataplane, self.metrics, settings, self.intake, self.access.gate)
+        self._grpc = GrpcServer(
+            self.dataplane, self.metrics, settings, self.intake, self.access, self._tracing
+        )
+        app = build_app(self.dataplane, self.metrics, settings, self.intake, self.access.gate, self._tracing)
         self._http = HttpServer(app, settings.http, settings, self.access.certificates)
         self._probes = (
             None
@@ -135,6 +143,8 @@ class Server:
             grace = max(started + self.settings.drain_seconds - time.perf_counter(), 0.0)
         await asyncio.gather(self._grpc.stop(grace), *(server.stop(grace) for server in self._http_servers()))
         await self.dataplane.close()
+        if self._tracing is not None:
+            await asyncio.to_thread(self._tracing.close)
         _log.info("stopped", seconds=round(time.perf_counter() - started, 3))
 
     async def run(self, when_ready: Callable[["Server"], None] | None = None) -> None:

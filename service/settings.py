@@ -173,6 +173,9 @@ class Settings(BaseSettings):
     record_files: int = Field(default=16, ge=2)
     """Max number of files in the folder of the recording; the oldest ones are deleted."""
 
+    tracing: bool = False
+    """Flag for traces by OpenTelemetry, sent by OTLP over gRPC as the standard ``OTEL_…`` variables say; they
+    need the extra ``tracing``."""
     revision: str = ""
     """Revision of the source that this server was built from, for GetVersion and ``forecast_build_info``."""
     log_level: Literal["debug", "info", "warning", "error"] = "info"

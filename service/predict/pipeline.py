@@ -5,7 +5,7 @@ import functools
 import secrets
 import time
 from collections import Counter
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Protocol, TypeVar
@@ -18,11 +18,11 @@ from model.scenes.resample import history_seconds
 from service.access.caller import Grant
 from service.lifecycle import Lifecycle
 from service.predict.admission import Admission, Call
-from service.predict.batcher import Batcher
+from service.predict.batcher import Batcher, Outcome
 from service.predict.catalog import Catalog
 from service.predict.encode import count_off_road, encode
 from service.predict.input_warnings import HISTORY_S, add_warnings, code_name, code_names, memory_warnings
-from service.predict.plan import Plan, frames_of, make_plan, set_outcomes
+from service.predict.plan import Group, Plan, frames_of, make_plan, set_outcomes
 from service.predict.rasters.library import RasterLibrary
 from service.predict.request import Agents, Options, read_agents, read_options
 from service.predict.request_reader import EncodedRequest, RequestReader
@@ -36,6 +36,7 @@ from service.predict.track_updates import (
 )
 from service.settings import Settings
 from service.telemetry.metrics import FORECAST_STATUSES, Metrics
+from service.telemetry.tracing import past_span, span
 from service.tracking.tracker import Tracker, TrackingResult
 
 if TYPE_CHECKING:
@@ -135,7 +136,8 @@ class Pipeline:
         call.started = time.perf_counter()
         async with call.in_time():
             # Decode
-            message = await self._reader.read(request) if isinstance(request, EncodedRequest) else request
+            with span("decode"):
+                message = await self._reader.read(request) if isinstance(request, EncodedRequest) else request
             if call.grant is not None:
                 call.grant.charge(len(message.agents))
             # Validate
@@ -148,26 +150,28 @@ class Pipeline:
             with self._admission.in_progress(call, options.predicted, options.priority):
                 # A map by its digest, which may be unknown; any other is read with the plan
                 raster = await self._rasters.find(message.scene_raster, call.remaining() - _RESERVE)
-                await self._admission.turn(call)
+                with span("turn"):
+                    await self._admission.turn(call)
                 # Recall
                 if options.recalls:
                     agents, recalled = await self._recall(message, options, forecaster, catalog, call)
                 # Plan
-                plan = await work(
-                    call,
-                    make_plan,
-                    message,
-                    options,
-                    forecaster,
-                    catalog,
-                    self._settings,
-                    agents,
-                    raster,
-                )
+                with span("plan"):
+                    plan = await work(
+                        call,
+                        make_plan,
+                        message,
+                        options,
+                        forecaster,
+                        catalog,
+                        self._settings,
+                        agents,
+                        raster,
+                    )
                 # Batch
                 await self._forecast(plan, call, work)
                 # Encode and remember; the track memory usually responds while the response is being encoded
-                encoding = work(call, self._encode, plan, _seed(options))
+                encoding = self._encoded(plan, call, work)
                 if not options.scene_id:
                     response = await encoding
                 else:
@@ -196,21 +200,22 @@ class Pipeline:
         """Return the agents with their histories from the track memory, and its response."""
         agents = await self._in_thread(call, read_agents, request, self._settings)
         own = observation_updates(agents, (forecaster, catalog.fallback))
-        tracked = await self._tracker.exchange(
-            options.scene_id,
-            options.time,
-            unambiguous(agents, own),
-            call.remaining() - _RESERVE,
-            history_s=history_seconds(frames_of(forecaster, catalog)),
-            latest=options.consistency,
-        )
+        with span("memory"):
+            tracked = await self._tracker.exchange(
+                options.scene_id,
+                options.time,
+                unambiguous(agents, own),
+                call.remaining() - _RESERVE,
+                history_s=history_seconds(frames_of(forecaster, catalog)),
+                latest=options.consistency,
+            )
         return with_histories(agents, own, tracked.histories), tracked
 
     async def _forecast(self, plan: Plan, call: Call, work: "_Work") -> None:
         """Run the plan's forwards, and forwards of the fallback for forecasts that are not finite."""
         groups = list(plan.groups)
         while True:
-            outcomes = await self._batcher.run([group.job for group in groups], call)
+            outcomes = await self._run(groups, call)
             broken = await work(call, set_outcomes, groups, outcomes)
             if not broken:
                 break
@@ -220,6 +225,28 @@ class Pipeline:
                     self._metrics.nonfinite.labels(draft.forecaster.info.name).inc()
             groups = await self._in_thread(call, plan.replace_broken, broken)
         plan.check_strict()
+
+    async def _run(self, groups: Sequence[Group], call: Call) -> list[Outcome]:
+        """Run the forwards of the groups."""
+        queued = time.perf_counter()
+        outcomes = await self._batcher.run([group.job for group in groups], call)
+        for group, outcome in zip(groups, outcomes, strict=True):
+            begun = call.started + outcome.queue
+            past_span("queue", queued, begun)
+            past_span(
+                "forward",
+                begun,
+                begun + outcome.inference,
+                model=group.job.forecaster.info.full_name,
+                agents=group.job.agents,
+                batch_agents=outcome.batch_agents,
+            )
+        return outcomes
+
+    async def _encoded(self, plan: Plan, call: Call, work: "_Work") -> pb.PredictResponse:
+        """Return the response of a plan whose forwards are done."""
+        with span("encode"):
+            return await work(call, self._encode, plan, _seed(plan.options))
 
     def _encode(self, plan: Plan, seed: int) -> pb.PredictResponse:
         raster = None if plan.scene is None else plan.scene.raster
@@ -234,9 +261,10 @@ class Pipeline:
         latest = options.consistency and not options.recalls
         patience = call.remaining() - _RESERVE
         history_s = None if options.recalls else HISTORY_S
-        return await self._tracker.exchange(
-            options.scene_id, options.time, stored, patience, history_s=history_s, latest=latest
-        )
+        with span("memory"):
+            return await self._tracker.exchange(
+                options.scene_id, options.time, stored, patience, history_s=history_s, latest=latest
+            )
 
     def _count_agents(self, plan: Plan) -> None:
         name = plan.forecaster.info.name

@@ -15,6 +15,7 @@ from prometheus_client import (
     ProcessCollector,
     generate_latest,
 )
+from prometheus_client.exposition import choose_encoder
 
 from cab.forecast.v1.prediction_service_pb2 import ForecastStatus
 from model.forecaster import ModelInfo, Protocol
@@ -245,11 +246,21 @@ class Metrics:
             if call.key is not None:
                 self.keys.count(call.key, call.code)
             if timed:
-                self.request_duration.labels(transport, method).observe(perf_counter() - started)
+                exemplar = {"trace_id": call.trace_id} if call.trace_id else None
+                self.request_duration.labels(transport, method).observe(perf_counter() - started, exemplar)
 
     def render(self) -> bytes:
         """Return the metrics in the Prometheus text format; this changes nothing."""
         return generate_latest(self.registry)
+
+    def render_for(self, accept: str) -> tuple[bytes, str]:
+        """Return the metrics with their media type: in OpenMetrics with exemplars, if that is accepted.
+
+        Args:
+            accept: the Accept header.
+        """
+        encode, media_type = choose_encoder(accept)
+        return encode(self.registry), media_type
 
 
 def _by_name(infos: list[ModelInfo], default: ModelInfo) -> dict[str, ModelInfo]:
@@ -267,5 +278,7 @@ class Call:
     def __init__(self) -> None:
         self.code = "CANCELLED"
         """Canonical status code; it stays CANCELLED if the client disconnects first."""
+        self.trace_id = ""
+        """Id of the trace, if it is sampled; else empty."""
         self.key: str | None = None
         """Name of the API key; None: there is none, or it was not accepted."""

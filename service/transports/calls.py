@@ -26,7 +26,8 @@ from service.errors import BadField, Internal, ServiceError
 from service.predict.dataplane import DataPlane
 from service.settings import Settings
 from service.telemetry.metrics import Call, Metrics
-from service.telemetry.request_ids import current_request_id
+from service.telemetry.request_ids import current_carrier, current_request_id
+from service.telemetry.tracing import Tracing
 from service.transports.method_errors import codes
 
 _log = structlog.get_logger(__name__)
@@ -98,16 +99,20 @@ class CallRecorder:
 class CallRecords:
     """Records of all calls of one transport: counts, durations and the access log."""
 
-    def __init__(self, transport: str, metrics: Metrics, settings: Settings) -> None:
+    def __init__(
+        self, transport: str, metrics: Metrics, settings: Settings, tracing: Tracing | None = None
+    ) -> None:
         """
         Args:
             transport: "grpc" or "rest".
             metrics: receives counts and durations.
             settings: say which share of the calls is logged.
+            tracing: traces the calls; None: they are not traced.
         """
         self._transport = transport
         self._metrics = metrics
         self._share = settings.access_log
+        self._tracing = tracing
         for route in ROUTES:
             metrics.begin_calls(transport, route.method, codes(transport, route))
 
@@ -119,12 +124,24 @@ class CallRecords:
             method: name of the contract's method.
             timed: False for streams, whose duration is up to the client.
         """
-        with self._metrics.call(self._transport, method, timed) as call:
+        with self._metrics.call(self._transport, method, timed) as call, self._traced(method, call):
             recorder = CallRecorder(self._transport, method, call, self._share)
             try:
                 yield recorder
             finally:
                 recorder.end()
+
+    @contextmanager
+    def _traced(self, method: str, call: Call) -> Iterator[None]:
+        if self._tracing is None:
+            yield
+            return
+        with self._tracing.call(self._transport, method, current_request_id(), current_carrier()) as span:
+            call.trace_id = span.trace_id
+            try:
+                yield
+            finally:
+                span.code = call.code
 
 
 def _is_sampled(request_id: str, share: float) -> bool:

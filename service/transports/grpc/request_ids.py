@@ -6,7 +6,7 @@ from typing import Any
 import grpc
 from grpc import aio
 
-from service.telemetry.request_ids import HEADER, TRACEPARENT, begin, ids_of
+from service.telemetry.request_ids import HEADER, TRACEPARENT, TRACESTATE, begin, ids_of
 
 
 class RequestIdInterceptor(aio.ServerInterceptor):  # type: ignore[type-arg]  # generic in the stubs only
@@ -19,7 +19,7 @@ class RequestIdInterceptor(aio.ServerInterceptor):  # type: ignore[type-arg]  # 
     ) -> "grpc.RpcMethodHandler[Any, Any]":
         """Return the method's handler; gRPC runs it in the same task."""
         metadata = dict(handler_call_details.invocation_metadata)
-        begin(ids_of(_text(metadata.get(HEADER)), _text(metadata.get(TRACEPARENT))))
+        begin(ids_of(*(_text(metadata.get(name)) for name in (HEADER, TRACEPARENT, TRACESTATE))))
         return await continuation(handler_call_details)
 
 

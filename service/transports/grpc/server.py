@@ -13,6 +13,7 @@ from service.access.tls import Certificates
 from service.predict.dataplane import DataPlane
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
+from service.telemetry.tracing import Tracing
 from service.transports.calls import CallRecords
 from service.transports.grpc.gate import GateInterceptor
 from service.transports.grpc.handlers import Handlers
@@ -39,11 +40,17 @@ class GrpcServer:
     """The gRPC server, with the contract's services, health and reflection."""
 
     def __init__(
-        self, dataplane: DataPlane, metrics: Metrics, settings: Settings, intake: Intake, access: Access
+        self,
+        dataplane: DataPlane,
+        metrics: Metrics,
+        settings: Settings,
+        intake: Intake,
+        access: Access,
+        tracing: Tracing | None = None,
     ) -> None:
         self._settings = settings
         self._access = access
-        records = CallRecords("grpc", metrics, settings)
+        records = CallRecords("grpc", metrics, settings, tracing)
         self._server = aio.server(
             interceptors=[
                 RequestIdInterceptor(),

@@ -3,7 +3,7 @@
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.telemetry.request_ids import HEADER, TRACEPARENT, begin, ids_of
+from service.telemetry.request_ids import HEADER, TRACEPARENT, TRACESTATE, begin, ids_of
 
 
 class RequestIdMiddleware:
@@ -15,7 +15,7 @@ class RequestIdMiddleware:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
         headers = Headers(scope=scope)
-        ids = ids_of(headers.get(HEADER), headers.get(TRACEPARENT))
+        ids = ids_of(headers.get(HEADER), headers.get(TRACEPARENT), headers.get(TRACESTATE))
         begin(ids)
 
         async def send_with_id(message: Message) -> None:

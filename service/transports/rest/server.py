@@ -26,7 +26,8 @@ from service.errors import BadField, MethodNotAllowed, NotFound, ServiceError, U
 from service.predict.dataplane import DataPlane
 from service.settings import Settings, split_address
 from service.telemetry.metrics import Metrics
-from service.telemetry.request_ids import HEADER, TRACEPARENT
+from service.telemetry.request_ids import HEADER, TRACEPARENT, TRACESTATE
+from service.telemetry.tracing import Tracing
 from service.transports.calls import CallRecords, to_service_error
 from service.transports.intake import Intake
 from service.transports.rest.connections import BoundedProtocol, Connections
@@ -46,7 +47,12 @@ _BACKLOG = 2048
 
 
 def build_app(
-    dataplane: DataPlane, metrics: Metrics, settings: Settings, intake: Intake, gate: Gate
+    dataplane: DataPlane,
+    metrics: Metrics,
+    settings: Settings,
+    intake: Intake,
+    gate: Gate,
+    tracing: Tracing | None = None,
 ) -> FastAPI:
     """Build the application: the contract's routes, probes, metrics and documentation.
 
@@ -56,6 +62,7 @@ def build_app(
         settings: limits.
         intake: bounds the calls and their bodies.
         gate: authenticates the callers.
+        tracing: traces the calls; None: they are not traced.
     """
     document = openapi_document(settings, closed=gate.closed)
     # Serve Swagger UI from local files: vehicle networks often cannot reach a CDN.
@@ -74,14 +81,17 @@ def build_app(
             CORSMiddleware,
             allow_origins=settings.cors_origins,
             allow_methods=["GET", "POST"],
-            allow_headers=["Authorization", TIMEOUT_HEADER, HEADER, TRACEPARENT],
+            allow_headers=["Authorization", TIMEOUT_HEADER, HEADER, TRACEPARENT, TRACESTATE],
             expose_headers=["Retry-After", HEADER],
         )
-    records = CallRecords("rest", metrics, settings)
+    records = CallRecords("rest", metrics, settings, tracing)
     for route, endpoint in Endpoints(dataplane, records, settings, intake, gate).by_route().items():
         app.add_route(route.path, endpoint, methods=[route.verb])
 
-    async def show_metrics(_: Request) -> Response:
+    async def show_metrics(request: Request) -> Response:
+        if tracing is not None:  # only OpenMetrics has exemplars
+            body, media_type = metrics.render_for(request.headers.get("accept", ""))
+            return Response(body, headers={"content-type": media_type})
         return Response(metrics.render(), media_type=prometheus_client.CONTENT_TYPE_LATEST)
 
     app.add_route(METRICS_PATH, show_metrics, methods=["GET"])
