@@ -396,7 +396,13 @@ def test_two_hertz_at_any_age_is_not_fitted(
     for name in ("velocity", "acceleration", "heading_rate"):
         if derivatives:
             np.testing.assert_array_equal(getattr(then, name)[0, -1], getattr(obs, name)[0, -1])
-        np.testing.assert_array_equal(getattr(now, name)[0, -1], getattr(then, name)[0, -1])
+        # A few microseconds of age count as none for some of the observations
+        np.testing.assert_allclose(
+            getattr(now, name)[0, -1],
+            getattr(then, name)[0, -1],
+            rtol=0,
+            atol=0 if derivatives or age > 1e-3 or not age else 1e-3,
+        )
     np.testing.assert_allclose(
         now.position[0, -1], obs.position[0, -1] + age * then.velocity[0, -1], rtol=0, atol=1e-3
     )

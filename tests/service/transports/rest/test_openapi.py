@@ -36,7 +36,8 @@ def test_every_message_field_and_value_has_its_comment_or_a_neighbor_has() -> No
     known = {m for file in FILES for m in file.message_types_by_name}
     known |= {e for file in FILES for e in file.enum_types_by_name}
     known |= {s for file in FILES for s in file.services_by_name}
-    assert {name.partition(".")[0] for name in texts} <= known
+    recorded = {"RecordedCall", "RecordedMap", "RecalledHistory"}  # files, not calls
+    assert {name.partition(".")[0] for name in texts} <= known | recorded
 
 
 def test_comments_of_nested_blocks() -> None:
