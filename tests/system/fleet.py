@@ -99,7 +99,7 @@ async def fleet(folder: Path, **settings: object) -> AsyncIterator[Fleet]:
     names = (":50051", ":8080", ":8404", "forecast:50051", "forecast:8080")
     ports = {name: free_port() for name in names}
     models = folder / "models"
-    models.mkdir()
+    models.mkdir(exist_ok=True)
     async with AsyncExitStack() as stack:
         redis = stack.enter_context(single(password="of-the-test"))  # noqa: S106
         replicas = await asyncio.gather(

@@ -1,0 +1,100 @@
+"""Prometheus scrapes every replica, and every panel of the dashboard has data."""
+
+import asyncio
+import re
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+import yaml
+
+from cab_forecast import AsyncClient, scene_raster
+from tests.deploy.files import PROMETHEUS, job_name, read_yaml
+from tests.deploy.test_dashboard import PANELS
+from tests.model.checkpoints import copy_bundled
+from tests.service.requests import make_request
+from tests.service.tracks import made_up
+from tests.system.fleet import Fleet, fleet, free_port, until
+from tests.system.programs import program
+
+pytestmark = pytest.mark.system
+_MODEL = "trajectron-no-context"
+_TOKEN = "of-the-test"  # noqa: S105
+_VARIABLES = {"$job": job_name(), "$model": ".*", "$__rate_interval": "1m", "$window": "1m"}
+
+
+def query_of(target: dict[str, Any]) -> str:
+    """Return the PromQL of a target with values for Grafana's variables."""
+    query: str = target["expr"]
+    for name, value in _VARIABLES.items():
+        query = query.replace(name, value)
+    return query
+
+
+def write_config(folder: Path, made: Fleet) -> Path:
+    """Write the files of deploy/prometheus with the addresses of a fleet and short intervals."""
+    (folder / "key").write_text(_TOKEN, encoding="ascii")
+    config = read_yaml(PROMETHEUS / "prometheus.yml")
+    config["global"] = {"scrape_interval": "1s", "evaluation_interval": "1s"}
+    for name in config["rule_files"]:  # beside the configuration
+        rules = read_yaml(PROMETHEUS / name)
+        for group in rules["groups"]:
+            group["interval"] = "1s"
+        (folder / name).write_text(yaml.safe_dump(rules), encoding="utf-8")
+    del config["alerting"]
+    servers, balancer = config["scrape_configs"]
+    del servers["dns_sd_configs"]
+    servers["authorization"] = {"credentials_file": str(folder / "key")}
+    servers["static_configs"] = [{"targets": [each.http for each in made.replicas]}]
+    balancer["static_configs"] = [{"targets": [re.sub(r"http://|/metrics", "", made.metrics)]}]
+    (folder / "prometheus.yml").write_text(yaml.safe_dump(config), encoding="utf-8")
+    return folder / "prometheus.yml"
+
+
+async def traffic(made: Fleet) -> None:
+    """Send calls that move every series: tracks that settle, maps, and a failure of the track memory."""
+    tracks = made_up("scene", agents=2)
+    off_road = make_request(1)
+    off_road.scene_raster.CopyFrom(scene_raster(np.zeros((3, 300, 300), dtype=np.uint8), (-50.0, -50.0)))
+    for endpoint in (made.grpc, made.rest):
+        async with AsyncClient(endpoint, token=_TOKEN, timeout=30) as client:
+            for frame in tracks.frames():
+                await client.predict(tracks.request(frame, _MODEL))
+            await client.predict(off_road)
+            await client.predict(off_road)
+    made.redis.pause()
+    try:
+        async with AsyncClient(made.grpc, token=_TOKEN, timeout=30) as client:
+            await client.predict(tracks.request(tracks.frames()[-1], _MODEL))
+    finally:
+        made.redis.resume()
+
+
+async def test_every_panel_of_the_dashboard_has_data(tmp_path: Path) -> None:
+    copy_bundled(tmp_path / "models" / _MODEL, _MODEL)
+    settings = {
+        "api_tokens": _TOKEN,
+        "default_model": _MODEL,
+        "record": tmp_path / "record",
+        "shadow": "kalman@1.0.0:1.0",
+    }
+    address = f"127.0.0.1:{free_port()}"
+    async with fleet(tmp_path, **settings) as made:
+
+        def ask(query: str) -> list[Any]:
+            response = httpx.get(f"http://{address}/api/v1/query", params={"query": query})
+            response.raise_for_status()
+            found: list[Any] = response.json()["data"]["result"]
+            return found
+
+        config = ["--config.file", str(write_config(tmp_path, made)), "--web.listen-address", address]
+        with program("prometheus", *config, "--storage.tsdb.path", str(tmp_path / "data")):
+            await until(lambda: len(ask(f'up{{job="{job_name()}"}} == 1')) == 2, "both replicas are scraped")
+            await until(lambda: ask('up{job="haproxy"} == 1'), "HAProxy is scraped")
+            await traffic(made)
+            await asyncio.sleep(3)  # two more scrapes, for the rates
+            queries = [query_of(target) for panel in PANELS for target in panel["targets"]]
+            empty = [query for query in queries if not await asyncio.to_thread(ask, query)]
+            assert not empty, "\n".join(empty)
