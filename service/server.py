@@ -3,6 +3,7 @@
 import asyncio
 import functools
 import signal
+import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -26,6 +27,10 @@ from service.transports.rest.server import HttpServer, build_app, build_probes
 _log = structlog.get_logger(__name__)
 
 
+_SWITCH_INTERVAL = 0.0005
+"""s, time for which one thread keeps the interpreter while others wait. When a native forward ends, its
+thread needs the interpreter to begin the next one; at Python's 5 ms the model would stand still for that long
+beside a busy event loop."""
 _READINESS_PERIOD = 1.0
 """Seconds between checks of the readiness that gRPC health reports."""
 
@@ -101,6 +106,7 @@ class Server:
             StartError: an address cannot be listened on, or a model is missing or broken.
         """
         started = time.perf_counter()
+        sys.setswitchinterval(_SWITCH_INTERVAL)
         try:
             await self._listen()
             await self.dataplane.open(self._load)
