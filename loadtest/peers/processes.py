@@ -5,7 +5,7 @@ import os
 import subprocess
 import tempfile
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 
@@ -45,20 +45,30 @@ async def running(name: str, served: ServedModel, body: bytes) -> AsyncIterator[
             process = subprocess.Popen(  # noqa: ASYNC220, S603 - it only starts the process
                 command, cwd=folder, env=environment, stderr=subprocess.STDOUT, stdout=output
             )
-        wire = peer.connect(f"{HOST}:{served.port}")
+        address = f"{HOST}:{served.port}"
         try:
-            await _until_answered(process, wire, body, log)
-            yield wire
+            await _until_answered(process, lambda: peer.connect(address), body, log)
+            # Channels that were refused while the peer started would wait before they connect again
+            wire = peer.connect(address)
+            try:
+                yield wire
+            finally:
+                await wire.close()
         finally:
-            await wire.close()
             await asyncio.to_thread(_end, process)
 
 
-async def _until_answered(process: "subprocess.Popen[bytes]", wire: Wire, body: bytes, log: Path) -> None:
+async def _until_answered(
+    process: "subprocess.Popen[bytes]", connect: Callable[[], Wire], body: bytes, log: Path
+) -> None:
     give_up = time.perf_counter() + _START_SECONDS
     code = ""
     while process.poll() is None and time.perf_counter() < give_up:
-        code = (await wire.call(body, None)).code
+        wire = connect()
+        try:
+            code = (await wire.call(body, None)).code
+        finally:
+            await wire.close()
         if code == "OK":
             return
         await asyncio.sleep(_PROBE_SECONDS)
