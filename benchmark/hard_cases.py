@@ -45,7 +45,7 @@ class HardCase:
     others: Floats
     """[M, 2], m, present positions of the other agents."""
     forecasts: Mapping[str, CaseForecast]
-    """By ``name@version``."""
+    """Values by ``name@version``."""
 
 
 def hardest_fde(fde_m: Floats, mismatch_m: Floats) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""How often the checks of the input are wrong, and how often they miss: ``python -m benchmark.input_checks``.
+"""Rates of wrong and of missed warnings of the input: ``python -m benchmark.input_checks``.
 
 Recorded scenes are turned into what a client would send at 2 Hz or, interpolated, at 10 Hz: the last 2 s of
 each agent with headings and velocities. The checks (``model.scenes.plausibility``) see each tick as it is and
@@ -37,7 +37,7 @@ _EPOCH = 1.5e9  # s, of frame 0: times as rounded as real ones
 
 @dataclass(frozen=True)
 class Tick:
-    """What a client sends of one frame: N agents."""
+    """The N agents that a client sends for one frame."""
 
     types: Sequence[AgentType]
     observations: Observations

@@ -49,7 +49,7 @@ class Replay:
 
     scenes: Sequence[PlannedScene]
     models: Mapping[str, Model]
-    """By ``name@version``."""
+    """Values by ``name@version``."""
     protocol: Protocol
     concurrency: int = 16
     """Maximum number of concurrent calls."""

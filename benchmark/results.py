@@ -64,7 +64,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class ContextRun:
-    """How the use of the context was measured."""
+    """Settings and time of the measurement of the use of the context."""
 
     no_context: str
     """``name@version`` of the model without context."""
@@ -97,7 +97,7 @@ class BenchmarkModelResult(ModelResult):
     """Missing forecasts among those requested for dispersion and convergence only."""
     latency: Latency | None = None
     context: Mapping[str, Mapping[str, Estimate]] = field(default_factory=dict)
-    """What the context does for the forecasts, by subset of the pairs and by name of the measure (see
+    """Effects of the context on the forecasts, by subset of the pairs and by name of the measure (see
     ``benchmark.context.measures``)."""
     context_missing: int = 0
     """Missing forecasts among those with a changed context."""

@@ -101,7 +101,7 @@ class Benchmark:
     limit: int | None = None
     """Number of pairs, from the first; None: all."""
     context: ContextSettings | None = None
-    """How the use of the context is measured; None: it is not."""
+    """Settings of the measurement of the use of the context; None: it is not measured."""
 
     @cached_property
     def context_benchmark(self) -> ContextBenchmark | None:

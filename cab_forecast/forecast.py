@@ -50,7 +50,7 @@ class InputWarning:
     code: str
     """Kind of contradiction, e.g. ``VELOCITY_MISMATCH``; ``UNSPECIFIED``: this client does not know it."""
     detail: str
-    """What contradicts what."""
+    """The parts of the input that contradict each other."""
     field: str
     """Path of the field in the request."""
 

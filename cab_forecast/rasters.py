@@ -35,7 +35,7 @@ class _Seen:
 
 @dataclass(frozen=True)
 class Sending:
-    """How the raster of a request is sent."""
+    """Decision on how the raster of a request is sent."""
 
     request: PredictRequest
     """The request to send."""

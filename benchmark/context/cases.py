@@ -39,7 +39,7 @@ class Change(StrEnum):
 
 @dataclass(frozen=True)
 class ContextSettings:
-    """How the use of the context is measured."""
+    """Settings of the measurement of the use of the context."""
 
     donors: int = 2
     """Maximum number of donors of a map, and of neighbours, for each pair."""

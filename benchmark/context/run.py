@@ -40,7 +40,7 @@ class ContextEvaluated:
 
     run: ContextRun
     measures: Mapping[str, Mapping[str, Mapping[str, Estimate]]]
-    """By ``name@version``, subset and name."""
+    """Values by ``name@version``, subset and name."""
     missing: Mapping[str, int]
     """Number of cases without a forecast, by ``name@version``."""
     each: Mapping[str, Floats]

@@ -37,7 +37,7 @@ FIRST_SWITCH, LAST_SWITCH = 5, 7
 """Steps (counted from 0) at which a hallucination changes its category."""
 
 View = TypeVar("View")
-"""What a generator has computed of a batch, for all categories."""
+"""Result of a generator for a batch, for all categories."""
 
 
 class Generator(ABC, Generic[View]):

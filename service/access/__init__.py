@@ -1,1 +1,1 @@
-"""Who may call, how much, and over which certificates."""
+"""Access: keys of callers with their limits, and certificates."""

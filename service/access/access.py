@@ -12,7 +12,7 @@ _PERIOD = 1.0
 
 
 class Access:
-    """What lets callers in: keys, and certificates for TLS."""
+    """Keys of callers, and certificates for TLS."""
 
     def __init__(self, settings: Settings, metrics: Metrics) -> None:
         """

@@ -79,7 +79,7 @@ class _Entry:
     agents: int
     call: Call
     queued: float
-    """By ``time.perf_counter``."""
+    """Time by ``time.perf_counter``."""
     done: "asyncio.Future[Outcome]" = field(
         default_factory=lambda: asyncio.get_running_loop().create_future()
     )

@@ -102,7 +102,7 @@ class Script:
     calls: list[Mapping[str, str]] = field(default_factory=list)
     """Headers of each call; "timeout" is what was left of the call's time, s."""
     times: list[float] = field(default_factory=list)
-    """When each call came, s, monotonic."""
+    """Times at which calls came, s, monotonic."""
     predicted: list[PredictRequest] = field(default_factory=list)
 
     def play(self, headers: Mapping[str, str]) -> None:

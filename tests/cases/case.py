@@ -60,9 +60,9 @@ class Facts:
     turned: float = 0.0
     """rad by which the car has turned left since it entered the junction."""
     noisy: bool = False
-    """Whether the observations are noisy."""
+    """True if the observations are noisy."""
     oriented: bool = True
-    """Whether the observations determine the heading."""
+    """True if the observations determine the heading."""
     companion: str = ""
     """Name of the case to compare with: the same drive without noise and with the full history."""
 

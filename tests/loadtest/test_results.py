@@ -1,4 +1,4 @@
-"""What became of calls, and reports of it."""
+"""Outcomes of calls, and reports of them."""
 
 import math
 from collections.abc import Sequence

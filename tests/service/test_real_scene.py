@@ -13,7 +13,7 @@ from tests.nuscenes_pred import real_request
 from tests.service.servers import settings
 
 SCENE = "scene-0234"
-"""Of all in train_val, the one with the most vehicles in a frame."""
+"""Scene of train_val with the most vehicles in a frame."""
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from typing import NamedTuple
 from tests.model.convert.assembler import legacy_file, mapping, module, named, number, storage, tensor, text
 
 LINKS = 15_000
-"""Of a chain; C code that calls itself for each would end the process."""
+"""Length of a chain; C code that calls itself for each would end the process."""
 
 
 class Hostile(NamedTuple):
@@ -116,7 +116,7 @@ HOSTILE: Mapping[str, Hostile] = {
     "a name without end": Hostile(named("a" * 1_000_000, "b"), "names aaa"),
     "groups within groups": Hostile(b"(" * 100_000, "more than 256 groups"),
 }
-"""By what they are; each is a file of at most some megabytes."""
+"""Hostile files by their kind; each is a file of at most some megabytes."""
 
 
 def _outcomes(folder: Path) -> Iterator[Outcome]:

@@ -6,7 +6,7 @@ from model.metrics.turns import turns_after_now
 
 
 def turns(past: list[float], future: list[float]) -> bool:
-    """Whether one agent with these headings, in degrees, turns after now."""
+    """Return whether one agent with these headings, in degrees, turns after now."""
     return bool(turns_after_now(np.deg2rad([past]), np.deg2rad([future]))[0])
 
 
