@@ -6,9 +6,10 @@ import resource
 import subprocess
 import sys
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterable, Iterator, Mapping
 from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -130,15 +131,22 @@ async def slow_readers(session: Session) -> None:
         session.arrivals(options.rate or 0.4 * peak, options.seconds), options.seconds, _deadline(session)
     )
     body = encode(session.requests[0].message, Encoding.PROTOBUF)
-    tasks = [asyncio.create_task(_never_read(session.http, body)) for _ in range(options.readers)]
-    try:
+    async with _beside(_never_read(session.http, body) for _ in range(options.readers)):
         result = await session.open_loop("slow readers", load, peak)
+    result.notes.append(f"{options.readers} clients that do not read; {_memory(result)}")
+    await session.recover(result)
+
+
+@asynccontextmanager
+async def _beside(clients: Iterable[Coroutine[Any, Any, None]]) -> AsyncIterator[None]:
+    """Run clients for the time of a block, and cancel them after it."""
+    tasks = [asyncio.create_task(client) for client in clients]
+    try:
+        yield
     finally:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-    result.notes.append(f"{options.readers} clients that do not read; {_memory(result)}")
-    await session.recover(result)
 
 
 async def cancelled(session: Session) -> None:
@@ -190,15 +198,15 @@ async def slow_uploads(session: Session) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     probes: list[float] = []
-    tasks = [asyncio.create_task(_probe(session.http, probes))]
-    tasks += [asyncio.create_task(_upload(session.http)) for _ in range(options.uploads)]
-    tasks += [asyncio.create_task(_half_header(session.http)) for _ in range(options.half_headers)]
+    clients = [
+        _probe(session.http, probes),
+        *(_upload(session.http) for _ in range(options.uploads)),
+        *(_half_header(session.http) for _ in range(options.half_headers)),
+    ]
     try:
-        result = await session.open_loop("slow uploads", load, peak)
+        async with _beside(clients):
+            result = await session.open_loop("slow uploads", load, peak)
     finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
     result.notes.append(
         f"{options.uploads} uploads of {_UPLOAD_BYTES / 1e6:g} MB, {options.half_headers} half headers; "

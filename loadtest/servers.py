@@ -63,12 +63,17 @@ def serving(
             ready = _until_ready(process, log, begin + _START_SECONDS)
             yield Server(ready["http"], ready["grpc"], time.perf_counter() - begin, process, log)
         finally:
-            process.terminate()
-            try:
-                process.wait(_STOP_SECONDS)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+            end(process, _STOP_SECONDS)
+
+
+def end(process: "subprocess.Popen[bytes]", seconds: float) -> None:
+    """Terminate a process, and kill it if it has not ended after some seconds."""
+    process.terminate()
+    try:
+        process.wait(seconds)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
 def random_checkpoint(folder: Path) -> None:

@@ -107,13 +107,8 @@ def find_contradictions(
     """
     recent = _Recent.of(observations)
     motion = _Motion.of(recent)
-    jumped = _jumps(recent)
-    found = [
-        *_time_units(recent),
-        *jumped,
-    ]
-    usable = np.ones(len(recent.time), dtype=np.bool_)
-    usable[[finding.row for finding in found]] = False
+    found = [*_time_units(recent), *_jumps(recent)]
+    usable = _without(recent, found)
     headings = _headings(recent, motion, types, usable)
     explained = {finding.row for finding in headings if finding.kind is not Contradiction.HEADING_MISMATCH}
     flips = [flip for flip in _flips(recent, usable) if flip.row not in explained]
@@ -135,9 +130,14 @@ def find_breaks(observations: Observations) -> list[Finding]:
     """
     recent = _Recent.of(observations)
     jumps = _jumps(recent)
-    usable = np.ones(len(recent.time), dtype=np.bool_)
-    usable[[finding.row for finding in jumps]] = False
-    return [*jumps, *_flips(recent, usable)]
+    return [*jumps, *_flips(recent, _without(recent, jumps))]
+
+
+def _without(recent: "_Recent", found: Sequence[Finding]) -> Bools:
+    """Return which agents nothing was found of: [N]."""
+    clean = np.ones(len(recent.time), dtype=np.bool_)
+    clean[[finding.row for finding in found]] = False
+    return clean
 
 
 @dataclass(frozen=True)

@@ -200,9 +200,7 @@ class Batcher:
 
     async def run_in_model_thread(self, job: Job) -> float:
         """Run a job past the queue, for warm-up, and learn how long it takes: the seconds that it returns."""
-        _, seconds = await self.call_in_model_thread(_forward, job, [job.inputs], job.steps, self._cutters)
-        self._costs.measure(job.key, job.agents, seconds)
-        return seconds
+        return (await self._run_alone(job)).inference
 
     @property
     def is_free(self) -> bool:
@@ -218,10 +216,13 @@ class Batcher:
 
     async def run_spare(self, job: Job) -> Outcome:
         """Run a job past the queue. The caller waits until ``is_free``, and counts the work."""
+        return await self._run_alone(job, usual=False)
+
+    async def _run_alone(self, job: Job, usual: bool = True) -> Outcome:
         mixture, seconds = await self.call_in_model_thread(
             _forward, job, [job.inputs], job.steps, self._cutters
         )
-        self._costs.measure(job.key, job.agents, seconds, usual=False)
+        self._costs.measure(job.key, job.agents, seconds, usual=usual)
         return Outcome(mixture, 0.0, seconds, job.agents)
 
     def forget(self, forecasters: Iterable[Forecaster]) -> None:

@@ -4,7 +4,6 @@ import asyncio
 import functools
 import secrets
 import time
-from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
@@ -35,7 +34,7 @@ from service.predict.track_updates import (
     with_histories,
 )
 from service.settings import Settings
-from service.telemetry.metrics import FORECAST_STATUSES, Metrics
+from service.telemetry.metrics import Metrics
 from service.telemetry.tracing import past_span, span
 from service.tracking.tracker import Tracker, TrackingResult
 
@@ -180,7 +179,7 @@ class Pipeline:
                     known = {} if options.recalls else stored.histories
                     told = memory_warnings(plan.agents, recalled or stored, known)
                     add_warnings(response, [draft.index for draft in plan.drafts], told)
-        self._count_agents(plan)
+        self._metrics.count_agents(plan.forecaster.info.name, (draft.status for draft in plan.drafts))
         self._count_warnings(response)
         if self.shadow is not None:
             call.when_sent = functools.partial(self.shadow.offer, message, plan, catalog)
@@ -265,11 +264,6 @@ class Pipeline:
             return await self._tracker.exchange(
                 options.scene_id, options.time, stored, patience, history_s=history_s, latest=latest
             )
-
-    def _count_agents(self, plan: Plan) -> None:
-        name = plan.forecaster.info.name
-        for status, count in Counter(draft.status for draft in plan.drafts).items():
-            self._metrics.agents.labels(name, FORECAST_STATUSES[status]).inc(count)
 
     def _count_warnings(self, response: pb.PredictResponse) -> None:
         for forecast in response.forecasts:

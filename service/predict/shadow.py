@@ -9,7 +9,7 @@ scenes of their own, whose ids are longer than those of any request.
 import asyncio
 import hashlib
 import random
-from collections import Counter, deque
+from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -208,9 +208,7 @@ class Shadow:
         raster = None if plan.scene is None else plan.scene.raster
         left = await loop.run_in_executor(self._thread, count_off_road, raster, groups)
         self._metrics.off_road.labels(name).inc(left.total())
-        for status, count in Counter(draft.status for draft in plan.drafts).items():
-            text = pb.ForecastStatus.Name(status).removeprefix("FORECAST_STATUS_").lower()
-            self._metrics.agents.labels(name, text).inc(count)
+        self._metrics.count_agents(name, (draft.status for draft in plan.drafts))
         options = work.options
         if options.scene_id:
             updates = await loop.run_in_executor(self._thread, forecast_updates, plan, False)

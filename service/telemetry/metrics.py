@@ -1,5 +1,6 @@
 """Prometheus metrics. Each server object has its own registry, so that one process can run several."""
 
+import collections
 import dataclasses
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -213,6 +214,16 @@ class Metrics:
                 error_m = info.benchmark.get(f"fde_ml_{seconds}s_m")
                 if error_m is not None:
                     self.benchmark.labels(info.name, f"{seconds}").set(error_m)
+
+    def count_agents(self, model: str, statuses: "Iterable[ForecastStatus.ValueType]") -> None:
+        """Count the agents of a call.
+
+        Args:
+            model: label of the model.
+            statuses: status of each agent.
+        """
+        for status, count in collections.Counter(statuses).items():
+            self.agents.labels(model, FORECAST_STATUSES[status]).inc(count)
 
     def set_build(self, build: Build) -> None:
         """Set the metric of the build."""

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from loadtest.servers import end
+
 _STOP_SECONDS = 10.0
 
 
@@ -38,11 +40,6 @@ def program(name: str, *arguments: str, cwd: Path | None = None) -> Iterator["su
             yield process
         finally:
             ended = process.poll()
-            process.terminate()
-            try:
-                process.wait(_STOP_SECONDS)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+            end(process, _STOP_SECONDS)
             output.seek(0)
             print(f"--- {name}, {ended=}", output.read().decode()[-3000:], sep="\n")  # noqa: T201 - for a failed test

@@ -85,7 +85,7 @@ class RefusedModel(_message.Message):
     folder: _builtins.str
     """Name of its folder in the folder of models."""
     reason: _builtins.str
-    """What is wrong with it."""
+    """The fault."""
     def __init__(
         self,
         *,

@@ -32,7 +32,7 @@ class _TrackingStatusEnumTypeWrapper(_enum_type_wrapper._EnumTypeWrapper[_Tracki
     TRACKING_STATUS_NEW: _TrackingStatus.ValueType  # 2
     """Nothing was remembered before."""
     TRACKING_STATUS_RESET: _TrackingStatus.ValueType  # 3
-    """What was remembered did not fit and was forgotten: the agent is farther from where it was than 100 m/s and 5 m
+    """The memory did not fit and was dropped: the agent is farther from where it was than 100 m/s and 5 m
     allow (0.1 m, at one time), or the call's time is more than 2 s before the scene's newest (a clock that jumped
     back). Another type of the agent is no reason: the track goes on, and AgentForecast.warnings say it. Of a scene:
     the memory that this server knew is gone; another one reset it, or the store has lost it.
@@ -49,7 +49,7 @@ TRACKING_STATUS_OK: TrackingStatus.ValueType  # 1
 TRACKING_STATUS_NEW: TrackingStatus.ValueType  # 2
 """Nothing was remembered before."""
 TRACKING_STATUS_RESET: TrackingStatus.ValueType  # 3
-"""What was remembered did not fit and was forgotten: the agent is farther from where it was than 100 m/s and 5 m
+"""The memory did not fit and was dropped: the agent is farther from where it was than 100 m/s and 5 m
 allow (0.1 m, at one time), or the call's time is more than 2 s before the scene's newest (a clock that jumped
 back). Another type of the agent is no reason: the track goes on, and AgentForecast.warnings say it. Of a scene:
 the memory that this server knew is gone; another one reset it, or the store has lost it.

@@ -26,7 +26,7 @@ if _version_not_supported:
 
 
 class ModelServiceStub:
-    """What the server can forecast with, and what it is.
+    """The models that the server forecasts with, and its build.
     """
 
     def __init__(self, channel):
@@ -53,7 +53,7 @@ class ModelServiceStub:
 
 
 class ModelServiceServicer:
-    """What the server can forecast with, and what it is.
+    """The models that the server forecasts with, and its build.
     """
 
     def ListModels(self, request, context):
@@ -104,7 +104,7 @@ def add_ModelServiceServicer_to_server(servicer, server):
 
  # This class is part of an EXPERIMENTAL API.
 class ModelService:
-    """What the server can forecast with, and what it is.
+    """The models that the server forecasts with, and its build.
     """
 
     @staticmethod

@@ -27,7 +27,7 @@ GRPC_GENERATED_VERSION: str
 GRPC_VERSION: str
 
 class ModelServiceStub:
-    """What the server can forecast with, and what it is."""
+    """The models that the server forecasts with, and its build."""
 
     @_typing.overload
     def __new__(cls, channel: _grpc.Channel) -> _Self: ...
@@ -42,7 +42,7 @@ class ModelServiceStub:
 
 @_typing.type_check_only
 class ModelServiceAsyncStub(ModelServiceStub):
-    """What the server can forecast with, and what it is."""
+    """The models that the server forecasts with, and its build."""
 
     def __init__(self, channel: _aio.Channel) -> None: ...
     ListModels: _aio.UnaryUnaryMultiCallable[_model_service_pb2.ListModelsRequest, _model_service_pb2.ListModelsResponse]  # type: ignore[assignment]
@@ -53,7 +53,7 @@ class ModelServiceAsyncStub(ModelServiceStub):
     """Version of the server itself; also while it is starting or draining."""
 
 class ModelServiceServicer(metaclass=_abc_1.ABCMeta):
-    """What the server can forecast with, and what it is."""
+    """The models that the server forecasts with, and its build."""
 
     @_abc_1.abstractmethod
     def ListModels(
