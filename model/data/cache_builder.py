@@ -160,7 +160,7 @@ def _agent_frame_arrays(
     frame, track = identity["frame"], identity["track"]
     rows = 1 + variants
     parts: list[Arrays] = []
-    for now in np.unique(frame):  # ascending, as the pairs are
+    for now in np.unique(frame):  # pairs are sorted by frame, too
         reports = []
         for variant in range(rows):
             seen, tracks = sensed.at(int(now), variant) if variant else recorded.at(int(now))
@@ -201,7 +201,7 @@ def _pair_arrays(
     identity = _identity(record, scene)
     frame, track = identity["frame"], identity["track"]
     parts: list[Arrays] = []
-    for now in np.unique(frame):  # ascending, as the pairs are
+    for now in np.unique(frame):  # pairs are sorted by frame, too
         seen, tracks = scenes.at(int(now))
         targets = np.searchsorted(tracks, track[frame == now])
         features = network_features(seen, targets, AgentType.VEHICLE, config.features, Context.FULL)
