@@ -149,6 +149,22 @@ class UnknownRaster(ServiceError):
         super().__init__(f"no raster with the digest {digest.hex()} is kept; send it whole")
 
 
+def check_id(field: str, value: str) -> None:
+    """Refuse an id of a scene or agent that is missing or too long.
+
+    Args:
+        field: the path of the id in the request.
+        value: the id.
+
+    Raises:
+        BadField: the id is empty, or longer than the contract allows.
+    """
+    if not value:
+        raise BadField(field, "is required")
+    if len(value) > MAX_ID_LENGTH:
+        raise BadField(field, id_too_long(value))
+
+
 class TooLarge(ServiceError):
     """Error of a request that exceeds a size limit; a retry would fail the same way."""
 

@@ -136,6 +136,9 @@ class Settings(BaseSettings):
     without a request first."""
     max_watchers: int = Field(default=64, ge=1)
     """Max number of streams of events on both transports; with Redis each holds a connection to it."""
+    max_frame_bytes: int = Field(default=64 * 2**20, ge=0)
+    """Max size of the frames that wait for slow watchers of scenes, of both transports; beyond it they lose
+    their oldest ones."""
     max_intake_bytes: int = Field(default=256 * 2**20, ge=2048)
     """Max size of the bodies of all calls in progress, of both transports; bodies above 1 MiB may take three
     quarters of it. REST counts a body when its length is known, or as it arrives; gRPC when it has arrived,

@@ -322,3 +322,22 @@ def _grid(
 
 def _float32(values: Floats) -> Tensor:
     return torch.from_numpy(values.astype(np.float32))
+
+
+def reduced(layers: Bytes, max_pixels: int) -> tuple[Bytes, int]:
+    """Return layers of at most ``max_pixels`` pixels, and the pixels along the side of one of theirs.
+
+    A pixel is set where any of its own is, so that dividers do not vanish.
+
+    Args:
+        layers: [L, rows, columns].
+        max_pixels: number of pixels, about.
+    """
+    count, rows, columns = layers.shape
+    step = math.ceil(math.sqrt(rows * columns / max_pixels))
+    if step <= 1:
+        return layers, 1
+    padded = np.pad(layers, ((0, 0), (0, -rows % step), (0, -columns % step)))
+    blocks = padded.reshape(count, padded.shape[1] // step, step, padded.shape[2] // step, step)
+    smaller: Bytes = blocks.max(axis=(2, 4))
+    return smaller, step

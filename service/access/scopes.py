@@ -11,9 +11,11 @@ from cab.forecast.v1.routes import (
     GET_VERSION,
     LIST_MODEL_CONSISTENCY,
     LIST_MODELS,
+    LIST_SCENES,
     PREDICT,
     RELOAD_MODELS,
     RESET_SCENE,
+    WATCH_FORECASTS,
     WATCH_SCENE,
     Route,
 )
@@ -25,7 +27,7 @@ class Scope(StrEnum):
     PREDICT = "predict"
     """Forecasts."""
     READ = "read"
-    """Consistency of agents, scenes and models."""
+    """Consistency of agents, scenes and models; live scenes and their forecasts."""
     RESET = "reset"
     """Deletion of scenes from the track memory."""
     METRICS = "metrics"
@@ -43,6 +45,8 @@ _SCOPES: Mapping[Route[Any, Any], Scope | None] = {
     GET_SCENE_CONSISTENCY: Scope.READ,
     LIST_MODEL_CONSISTENCY: Scope.READ,
     WATCH_SCENE: Scope.READ,
+    LIST_SCENES: Scope.READ,
+    WATCH_FORECASTS: Scope.READ,
     RESET_SCENE: Scope.RESET,
     RELOAD_MODELS: Scope.ADMIN,
 }

@@ -80,8 +80,8 @@ class Call:
         """Name of the caller's key; None: there is none."""
         self.grant: Grant | None = None
         """Counter of the request's agents against the limits of the key; None: there are no limits."""
-        self.when_sent: Callable[[], None] | None = None
-        """Function to call once the response has been sent; None: there is none."""
+        self.when_sent: list[Callable[[], None]] = []
+        """Functions to call once the response has been sent."""
         self.is_trial = False
         """True if it was accepted even if it is expected to be late."""
         self.share = 0

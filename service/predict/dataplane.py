@@ -8,6 +8,7 @@ import structlog
 
 from cab.forecast.v1 import admin_service_pb2 as admin_pb
 from cab.forecast.v1 import model_service_pb2 as pb
+from service.access.watchers import Watchers
 from service.cores import whole_cores
 from service.errors import BadField, Unavailable
 from service.lifecycle import Lifecycle, Phase
@@ -15,12 +16,16 @@ from service.predict.admission import Admission
 from service.predict.batcher import Batcher
 from service.predict.catalog import Catalog, reference
 from service.predict.pipeline import Pipeline
+from service.predict.publisher import Publisher
 from service.predict.rasters.library import RasterLibrary
 from service.predict.rasters.shared import SharedRasters
 from service.predict.reload import Load, Reloader
 from service.predict.shadow import Shadow
 from service.predict.torch_threads import forward_threads, set_helper_threads
 from service.recording.factory import make_recorder
+from service.scenes.fanout import FrameFanout
+from service.scenes.live import LiveScenes
+from service.scenes.service import SceneService
 from service.settings import Settings, split_shadow
 from service.telemetry.build import build_of
 from service.telemetry.metrics import Metrics
@@ -69,16 +74,16 @@ class DataPlane:
         shadow_tracker = self._make_shadow_tracker(store_metrics)
         shadow_aggregates = None if shadow_tracker is None else shadow_tracker.aggregates
         metrics.registry.register(ConsistencyCollector(tracker.aggregates, shadow_aggregates))
+        watchers = Watchers(settings.max_watchers, metrics)
         self.consistency = ConsistencyService(
-            self._store,
-            self._asking,
-            tracker,
-            self._references,
-            self._lifecycle,
-            settings.max_watchers,
-            metrics,
+            self._store, self._asking, tracker, self._references, self._lifecycle, watchers
         )
         """Calls of the consistency service."""
+        live = LiveScenes(settings.track_expiry)
+        fanout = FrameFanout(settings.max_frame_bytes, metrics)
+        self.scenes = SceneService(live, fanout, watchers, self._lifecycle)
+        """Calls of the scene service."""
+        self._publisher = Publisher(live, fanout, self._references, metrics)
         self._rasters = RasterLibrary(
             settings, metrics, self._threads, SharedRasters.from_settings(settings, store_metrics)
         )
@@ -90,11 +95,14 @@ class DataPlane:
             self._batcher,
             tracker,
             self._rasters,
+            self._publisher,
             self._threads,
         )
         if settings.shadow is not None and shadow_tracker is not None:
             name, share = split_shadow(settings.shadow)
-            self._pipeline.shadow = Shadow(name, share, settings, metrics, self._batcher, shadow_tracker)
+            self._pipeline.shadow = Shadow(
+                name, share, settings, metrics, self._batcher, shadow_tracker, self._publisher
+            )
         self._reloader: Reloader | None = None
         self._reloads: set[asyncio.Task[admin_pb.ReloadModelsResponse]] = set()
         self._following: asyncio.Task[None] | None = None
@@ -220,6 +228,7 @@ class DataPlane:
             self._reloader.close()
         if self._pipeline.shadow is not None:
             await self._pipeline.shadow.close()
+        await self._publisher.close()
         await self._batcher.stop()
         if self._pipeline.recorder is not None:
             await asyncio.to_thread(self._pipeline.recorder.close, _RECORDER_SECONDS)

@@ -20,7 +20,7 @@ from service.predict.wire import packed_doubles, packed_tag
 _WEIGHTS, _MEANS, _COVARIANCES, _SAMPLES = (
     packed_tag(pb.AgentForecast.DESCRIPTOR, name) for name in ("weights", "means", "covariances", "samples")
 )
-_TRIANGLE = ((0, 0), (0, 1), (1, 1))
+TRIANGLE = ((0, 0), (0, 1), (1, 1))
 """Elements of a covariance that are sent."""
 
 
@@ -111,7 +111,7 @@ def _fill(
             merged = merge_modes(mixture)
             mixture, counts, mode_ids = merged.mixture, merged.counts.numpy(), merged.mode_ids.numpy()
             modes = mode_ids.shape[1]
-    weights = _softmax(mixture.log_weights.numpy().astype(np.float64))
+    weights = softmax(mixture.log_weights.numpy().astype(np.float64))
     means, covariances = mixture.means.numpy(), mixture.covariances.numpy()
     remaining = np.zeros(agents)
     if 0 < options.max_modes < modes:
@@ -128,7 +128,7 @@ def _fill(
         remaining = np.clip(1.0 - weights.sum(axis=1), 0.0, 1.0)
     positions: Floats = means + mixture.origin.numpy()[:, None, None]
     triangles: Floats = np.empty((*covariances.shape[:-2], 3))
-    for place, (row, column) in enumerate(_TRIANGLE):
+    for place, (row, column) in enumerate(TRIANGLE):
         triangles[..., place] = covariances[..., row, column]
     best, left, numbers = weights.argmax(axis=1).tolist(), remaining.tolist(), mode_ids.tolist()
     for row, (forecast, count) in enumerate(zip(forecasts, counts.tolist(), strict=True)):
@@ -144,7 +144,8 @@ def _fill(
         )
 
 
-def _softmax(log_weights: Floats) -> Floats:
+def softmax(log_weights: Floats) -> Floats:
+    """Return the probabilities [N, K] of log-weights [N, K]."""
     weights: Floats = np.exp(log_weights - log_weights.max(axis=1, keepdims=True))
     weights /= weights.sum(axis=1, keepdims=True)
     return weights

@@ -22,6 +22,7 @@ from service.predict.catalog import Catalog
 from service.predict.encode import count_off_road, encode
 from service.predict.input_warnings import HISTORY_S, add_warnings, code_name, code_names, memory_warnings
 from service.predict.plan import Group, Plan, frames_of, make_plan, set_outcomes
+from service.predict.publisher import Publisher
 from service.predict.rasters.library import RasterLibrary
 from service.predict.request import Agents, Options, read_agents, read_options
 from service.predict.request_reader import EncodedRequest, RequestReader
@@ -78,6 +79,7 @@ class Pipeline:
         batcher: Batcher,
         tracker: Tracker,
         rasters: RasterLibrary,
+        publisher: Publisher,
         threads: Executor,
     ) -> None:
         self._settings = settings
@@ -87,6 +89,7 @@ class Pipeline:
         self._batcher = batcher
         self._tracker = tracker
         self._rasters = rasters
+        self._publisher = publisher
         self._threads = threads
         self._reader = RequestReader(threads)
         self.shadow: Shadow | None = None
@@ -114,8 +117,8 @@ class Pipeline:
             call.caller, call.grant = grant.caller.name, grant
         with self._lifecycle.in_progress():
             yield call
-        if call.when_sent is not None:
-            call.when_sent()
+        for work in call.when_sent:
+            work()
 
     async def predict(
         self, request: pb.PredictRequest | EncodedRequest, call: Call | None = None
@@ -175,6 +178,9 @@ class Pipeline:
                     response = await encoding
                 else:
                     response, stored = await asyncio.gather(encoding, self._remember(plan, recalled, call))
+                    instants = (recalled or stored).instants
+                    publish = functools.partial(self._publisher.answered, message, plan, response, instants)
+                    call.when_sent.append(publish)
                     report(response, recalled, stored)
                     known = {} if options.recalls else stored.histories
                     told = memory_warnings(plan.agents, recalled or stored, known)
@@ -182,7 +188,7 @@ class Pipeline:
         self._metrics.count_agents(plan.forecaster.info.name, (draft.status for draft in plan.drafts))
         self._count_warnings(response)
         if self.shadow is not None:
-            call.when_sent = functools.partial(self.shadow.offer, message, plan, catalog)
+            call.when_sent.append(functools.partial(self.shadow.offer, message, plan, catalog))
         if self.recorder is not None:
             shown = raster if plan.scene is None else plan.scene.raster
             self.recorder.record(message, response, shown, {} if recalled is None else recalled.histories)

@@ -95,6 +95,8 @@ class Plan:
     warnings: list[str]
     input_warnings: Warnings
     """Contradictions in the input of agents."""
+    rows: dict[int, int] = field(default_factory=dict)
+    """Rows of the usable agents in the scene, by index in the request."""
     groups: list[Group] = field(default_factory=list)
 
     def add_groups(self, drafts: Iterable[Draft]) -> list[Group]:
@@ -194,7 +196,7 @@ def make_plan(
         elif agents.predict[index] and scene is not None:
             drafts.append(_assign(index, agent_id, scene, rows[index], (forecaster, catalog.fallback)))
     warnings = input_warnings(request, agents, raster)
-    plan = Plan(options, agents, forecaster, catalog.fallback, scene, drafts, [], warnings)
+    plan = Plan(options, agents, forecaster, catalog.fallback, scene, drafts, [], warnings, rows)
     plan.check_strict()
     plan.warnings.extend(_warnings(plan))
     plan.warnings.extend(of_context_agents(warnings, [draft.index for draft in drafts]))

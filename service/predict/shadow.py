@@ -24,6 +24,7 @@ from service.predict.batcher import Batcher, combine
 from service.predict.catalog import Catalog
 from service.predict.encode import count_off_road
 from service.predict.plan import Plan, make_plan, set_outcomes
+from service.predict.publisher import Publisher
 from service.predict.request import Agents, Options
 from service.predict.torch_threads import set_helper_threads
 from service.predict.track_updates import forecast_updates
@@ -71,6 +72,7 @@ class Shadow:
         metrics: Metrics,
         batcher: Batcher,
         tracker: Tracker,
+        publisher: Publisher,
     ) -> None:
         """
         Args:
@@ -80,6 +82,7 @@ class Shadow:
             metrics: receives its series, with ``name@version`` as the model.
             batcher: runs its forwards.
             tracker: stores its forecasts, and aggregates what comes of them.
+            publisher: shows its forecasts to those who watch the scene.
         """
         self._name = name
         self._share = share
@@ -87,6 +90,7 @@ class Shadow:
         self._metrics = metrics
         self._batcher = batcher
         self._tracker = tracker
+        self._publisher = publisher
         self._forecaster: Forecaster | None = None
         self._queue: deque[_Work] = deque()
         self._bytes = 0
@@ -213,7 +217,8 @@ class Shadow:
         if options.scene_id:
             updates = await loop.run_in_executor(self._thread, forecast_updates, plan, False)
             scene_id = _own_scene(options.scene_id, name)
-            await self._tracker.exchange(scene_id, options.time, updates, STORE_TIMEOUT)
+            stored = await self._tracker.exchange(scene_id, options.time, updates, STORE_TIMEOUT)
+            self._publisher.shadowed(work.request, plan, stored.instants)
 
     async def _until_free(self, work: _Work) -> None:
         """Wait until nothing waits for the model.

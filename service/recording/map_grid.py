@@ -1,14 +1,12 @@
 """The map of a call as a Foxglove grid."""
 
-import math
-
 import numpy as np
 from foxglove_schemas_protobuf.Grid_pb2 import Grid
 from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 from foxglove_schemas_protobuf.Vector2_pb2 import Vector2
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from model.arrays import Bytes
+from model.scenes.raster import reduced
 from model.scenes.scene import Raster
 from service.recording.frames import GROUND, pose
 
@@ -23,7 +21,7 @@ _COLORS = np.array([(74, 80, 90, 255), (217, 154, 28, 255), (235, 235, 235, 255)
 
 def map_grid(raster: Raster, time: Timestamp) -> Grid:
     """Return the layers of a raster as a grid of colours; what no layer covers is transparent."""
-    layers, step = _reduced(raster.layers)
+    layers, step = reduced(raster.layers, _MAX_CELLS)
     _, rows, columns = layers.shape
     colors = np.zeros((columns, rows, len(_CHANNELS)), dtype=np.uint8)  # rows of a grid run along x
     for layer, color in zip(layers, _COLORS, strict=True):
@@ -45,18 +43,3 @@ def map_grid(raster: Raster, time: Timestamp) -> Grid:
         ],
         data=colors.tobytes(),
     )
-
-
-def _reduced(layers: Bytes) -> tuple[Bytes, int]:
-    """Return layers of at most ``_MAX_CELLS`` cells, and the pixels along the side of a cell.
-
-    A cell is set where any of its pixels is, so that dividers do not vanish.
-    """
-    count, rows, columns = layers.shape
-    step = math.ceil(math.sqrt(rows * columns / _MAX_CELLS))
-    if step <= 1:
-        return layers, 1
-    padded = np.pad(layers, ((0, 0), (0, -rows % step), (0, -columns % step)))
-    blocks = padded.reshape(count, padded.shape[1] // step, step, padded.shape[2] // step, step)
-    reduced: Bytes = blocks.max(axis=(2, 4))
-    return reduced, step

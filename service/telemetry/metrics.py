@@ -132,6 +132,28 @@ class Metrics:
         )
         for reason in ("queue_full", "late", "dropped", "displaced", "concurrency", "bytes", "watchers"):
             self.refused.labels(reason)
+        self.watchers = Gauge(
+            "forecast_watchers",
+            "Open streams of events by method.",
+            ["method"],
+            registry=self.registry,
+        )
+        for method in ("WatchScene", "WatchForecasts"):
+            self.watchers.labels(method)
+        self.frames = Counter(
+            "forecast_frames_total",
+            "Frames made for watchers of scenes.",
+            registry=self.registry,
+        )
+        self.frames_dropped = Counter(
+            "forecast_frames_dropped_total",
+            "Frames that watchers of scenes did not get: a watcher read too slowly (watcher, counted for "
+            "each), or frames were asked for faster than they are made (busy).",
+            ["reason"],
+            registry=self.registry,
+        )
+        for cause in ("watcher", "busy"):
+            self.frames_dropped.labels(cause)
         self.keys = KeyMetrics(self.registry)
         self.raster_lookups = Counter(
             "forecast_raster_lookups_total",

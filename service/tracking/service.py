@@ -2,12 +2,12 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Sequence
+from contextlib import aclosing
 
 from cab.forecast.v1 import consistency_service_pb2 as pb
-from cab.forecast.v1.bounds import MAX_ID_LENGTH
-from service.errors import BadField, Overloaded, TrackingUnavailable, UnknownTrack, id_too_long
+from service.access.watchers import Watchers
+from service.errors import BadField, TrackingUnavailable, UnknownTrack, check_id
 from service.lifecycle import Lifecycle
-from service.telemetry.metrics import Metrics
 from service.tracking.aggregates import Aggregates
 from service.tracking.messages import instant_messages, model_messages
 from service.tracking.metrics import InstantMetrics, instant_metrics
@@ -20,8 +20,6 @@ DEFAULT_WINDOW = 2.0
 """Seconds of an agent's observations, counted back from its newest one."""
 SCENE_WINDOW = 4.0
 """Seconds for the aggregates of a scene; longer, because off-lag forecasts settle after 2 s."""
-_WATCH_RETRY = 5.0
-"""Seconds until a client that was refused should try to watch again."""
 
 
 class ConsistencyService:
@@ -33,8 +31,7 @@ class ConsistencyService:
         tracker: tracker of the Predict calls.
         references: references to models.
         lifecycle: lifecycle of the server.
-        max_watchers: max number of ``watch_scene`` calls.
-        metrics: counts those that are refused.
+        watchers: bound the ``watch_scene`` calls, and end them.
     """
 
     def __init__(
@@ -44,18 +41,14 @@ class ConsistencyService:
         tracker: Tracker,
         references: ModelReferences,
         lifecycle: Lifecycle,
-        max_watchers: int,
-        metrics: Metrics,
+        watchers: Watchers,
     ) -> None:
         self._store = store
         self._guard = guard
         self._tracker = tracker
         self._references = references
         self._lifecycle = lifecycle
-        self._max_watchers = max_watchers
-        self._metrics = metrics
-        self._watchers = 0
-        self._ended = asyncio.Event()
+        self._watchers = watchers
 
     async def get_agent(self, request: pb.GetAgentConsistencyRequest) -> pb.GetAgentConsistencyResponse:
         """Return the consistency of one agent over its last seconds.
@@ -67,8 +60,8 @@ class ConsistencyService:
             Unavailable: the server is not ready.
         """
         self._lifecycle.require_ready()
-        _check_id("scene_id", request.scene_id)
-        _check_id("agent_id", request.agent_id)
+        check_id("scene_id", request.scene_id)
+        check_id("agent_id", request.agent_id)
         if not 0 <= request.window <= WINDOW:
             raise BadField("window", f"must be within 0 … {WINDOW:g} s")
         snapshot = await self._read(request.scene_id, request.window or DEFAULT_WINDOW, request.agent_id)
@@ -82,7 +75,7 @@ class ConsistencyService:
             BadField, UnknownTrack, TrackingUnavailable, Unavailable: as ``get_agent``.
         """
         self._lifecycle.require_ready()
-        _check_id("scene_id", request.scene_id)
+        check_id("scene_id", request.scene_id)
         snapshot = await self._read(request.scene_id, SCENE_WINDOW)
         instants = snapshot.instants
         metrics = await asyncio.to_thread(instant_metrics, instants.packed)
@@ -115,7 +108,7 @@ class ConsistencyService:
             BadField, TrackingUnavailable, Unavailable: as ``get_agent``.
         """
         self._lifecycle.require_ready()
-        _check_id("scene_id", request.scene_id)
+        check_id("scene_id", request.scene_id)
         try:
             agents = await self._guard.run(
                 "reset", lambda: self._store.reset(request.scene_id), STORE_TIMEOUT
@@ -132,38 +125,20 @@ class ConsistencyService:
             Overloaded: there are too many watchers.
         """
         self._lifecycle.require_ready()
-        _check_id("scene_id", request.scene_id)
-        if self._watchers >= self._max_watchers:
-            self._metrics.refused.labels("watchers").inc()
-            raise Overloaded(f"{self._watchers} calls watch already", _WATCH_RETRY)
-        self._watchers += 1
-        source = self._store.watch(request.scene_id)
-        ended = asyncio.ensure_future(self._ended.wait())
-        try:
-            while not self._ended.is_set():
-                next_events = asyncio.ensure_future(anext(source))
-                try:
-                    await asyncio.wait({next_events, ended}, return_when=asyncio.FIRST_COMPLETED)
-                    if not next_events.done():
-                        return
-                    events, missed = next_events.result()
-                finally:
-                    next_events.cancel()
-                    await asyncio.gather(next_events, return_exceptions=True)
-                instants = [pb.InstantConsistency.FromString(event) for event in events]
-                yield pb.WatchSceneResponse(instants=instants, missed=missed)
-        except StopAsyncIteration:
-            return
-        except StoreError as error:
-            raise TrackingUnavailable(str(error)) from error
-        finally:
-            self._watchers -= 1
-            ended.cancel()
-            await source.aclose()
+        check_id("scene_id", request.scene_id)
+        async with self._watchers.watching("WatchScene"):
+            source = self._watchers.until_ended(self._store.watch(request.scene_id))
+            try:
+                async with aclosing(source):
+                    async for events, missed in source:
+                        instants = [pb.InstantConsistency.FromString(event) for event in events]
+                        yield pb.WatchSceneResponse(instants=instants, missed=missed)
+            except StoreError as error:
+                raise TrackingUnavailable(str(error)) from error
 
     def end_watching(self) -> None:
-        """End all ``watch_scene`` calls."""
-        self._ended.set()
+        """End all streams of events."""
+        self._watchers.end()
 
     async def _read(self, scene_id: str, window: float, agent_id: str | None = None) -> SceneSnapshot:
         try:
@@ -184,10 +159,3 @@ class ConsistencyService:
         agent_ids = [instants.agent_ids[row] for row in rows]
         models = [instants.models[row] for row in rows]
         return instant_messages(metrics.rows(rows), agent_ids, models, self._references)
-
-
-def _check_id(field: str, value: str) -> None:
-    if not value:
-        raise BadField(field, "is required")
-    if len(value) > MAX_ID_LENGTH:
-        raise BadField(field, id_too_long(value))

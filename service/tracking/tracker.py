@@ -1,7 +1,7 @@
 """Track memory of the Predict calls: it never delays a forecast."""
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from time import perf_counter
@@ -11,7 +11,14 @@ from service.tracking.aggregates import Aggregates
 from service.tracking.messages import AGENT_TRACKING, SCENE_TRACKING, instant_messages
 from service.tracking.metrics import instant_metrics
 from service.tracking.model_references import ModelReferences
-from service.tracking.store.base import ExchangeResult, StoreError, TrackStatus, TrackStore, TrackUpdate
+from service.tracking.store.base import (
+    ExchangeResult,
+    Instants,
+    StoreError,
+    TrackStatus,
+    TrackStore,
+    TrackUpdate,
+)
 from service.tracking.store.guard import Guard
 
 STORE_TIMEOUT = 2.0
@@ -35,6 +42,8 @@ class TrackingResult:
     """History by agent id, if requested."""
     latest: dict[str, pb.InstantConsistency] = field(default_factory=dict)
     """Consistency at the newest observation by agent id, if requested."""
+    instants: Instants = field(default_factory=Instants)
+    """What ``latest`` is made of."""
     seconds: float = 0.0
     """Seconds that the call waited for the memory."""
 
@@ -129,9 +138,11 @@ class Tracker:
         )
         tracking.behind_s = result.behind_s
         tracking.histories = dict(zip(ids, result.histories, strict=False))
+        tracking.instants = result.instants
         if latest:
             messages = self._aggregate(scene_id, result, latest)
-            tracking.latest = _newest(updates, result.instants.models, messages)
+            requested = {update.agent_id: update.model for update in updates}
+            tracking.latest = _newest(requested, result.instants.models, messages)
         else:
             self._aggregate_later(scene_id, result)
         tracking.seconds = perf_counter() - started
@@ -185,17 +196,33 @@ class Tracker:
             del self._publishing[scene_id]
 
 
-def _newest(
-    updates: Sequence[TrackUpdate], models: Sequence[str], messages: Sequence[pb.InstantConsistency]
+def latest_consistency(
+    requested: Mapping[str, str], instants: Instants, references: ModelReferences
 ) -> dict[str, pb.InstantConsistency]:
-    """Return the newest instant of each agent, for the model of its update.
+    """Return the consistency at each agent's newest observation, by agent id. Takes milliseconds.
 
     Args:
-        updates: updates of the call.
+        requested: the model of each agent, ``name@version`` by agent id.
+        instants: what the exchange of the call returned.
+        references: references to models.
+    """
+    if not instants.models:
+        return {}
+    metrics = instant_metrics(instants.packed)
+    messages = instant_messages(metrics, instants.agent_ids, instants.models, references)
+    return _newest(requested, instants.models, messages)
+
+
+def _newest(
+    requested: Mapping[str, str], models: Sequence[str], messages: Sequence[pb.InstantConsistency]
+) -> dict[str, pb.InstantConsistency]:
+    """Return the newest instant of each agent, for its model.
+
+    Args:
+        requested: the model of each agent.
         models: [P], the model of each message.
         messages: [P].
     """
-    requested = {update.agent_id: update.model for update in updates}
     newest: dict[str, pb.InstantConsistency] = {}
     for model, message in zip(models, messages, strict=True):
         known = newest.get(message.agent_id)

@@ -1,7 +1,7 @@
 """Parts of a call that both transports share: accounting, error mapping, and the methods to execute."""
 
 import zlib
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager
 from time import perf_counter
 from typing import Any, TypeVar
@@ -16,9 +16,12 @@ from cab.forecast.v1.routes import (
     GET_VERSION,
     LIST_MODEL_CONSISTENCY,
     LIST_MODELS,
+    LIST_SCENES,
     RELOAD_MODELS,
     RESET_SCENE,
     ROUTES,
+    WATCH_FORECASTS,
+    WATCH_SCENE,
     Route,
 )
 from service.access.caller import Caller
@@ -29,6 +32,7 @@ from service.telemetry.metrics import Call, Metrics
 from service.telemetry.request_ids import current_carrier, current_request_id
 from service.telemetry.tracing import Tracing
 from service.transports.method_errors import codes
+from service.transports.streams import Event
 
 _log = structlog.get_logger(__name__)
 _Message = TypeVar("_Message", bound=Message)
@@ -42,9 +46,16 @@ UNARY_METHODS: Mapping[Route[Any, Any], Callable[[DataPlane, Any], Awaitable[Mes
     GET_SCENE_CONSISTENCY: lambda dataplane, request: dataplane.consistency.get_scene(request),
     LIST_MODEL_CONSISTENCY: lambda dataplane, request: dataplane.consistency.list_models(request),
     RESET_SCENE: lambda dataplane, request: dataplane.consistency.reset_scene(request),
+    LIST_SCENES: lambda dataplane, request: dataplane.scenes.list_scenes(request),
     RELOAD_MODELS: lambda dataplane, request: dataplane.reload_models(request),
 }
 """Functions that execute the unary methods except Predict, whose requests are decoded off the event loop."""
+
+STREAMS: Mapping[Route[Any, Any], Callable[[DataPlane, Any], AsyncIterator[Event]]] = {
+    WATCH_SCENE: lambda dataplane, request: dataplane.consistency.watch_scene(request),
+    WATCH_FORECASTS: lambda dataplane, request: dataplane.scenes.watch_forecasts(request),
+}
+"""Functions that open the streams of events."""
 
 
 class CallRecorder:

@@ -10,9 +10,11 @@ from cab.forecast.v1.routes import (
     GET_VERSION,
     LIST_MODEL_CONSISTENCY,
     LIST_MODELS,
+    LIST_SCENES,
     PREDICT,
     RELOAD_MODELS,
     RESET_SCENE,
+    WATCH_FORECASTS,
     WATCH_SCENE,
     Route,
 )
@@ -63,6 +65,8 @@ _ERRORS: Mapping[Route[Any, Any], Errors] = {
     GET_SCENE_CONSISTENCY: (BadFields, UnknownTrack, TrackingUnavailable),
     LIST_MODEL_CONSISTENCY: (BadFields,),
     WATCH_SCENE: (BadFields, TrackingUnavailable),
+    LIST_SCENES: (BadFields,),
+    WATCH_FORECASTS: (BadFields,),
     RESET_SCENE: (BadFields, TooLarge, UnsupportedMediaType, RequestTimeout, TrackingUnavailable),
     RELOAD_MODELS: (BadFields, TooLarge, UnsupportedMediaType, RequestTimeout, ReloadRefused),
 }

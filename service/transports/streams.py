@@ -5,7 +5,14 @@ from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import asynccontextmanager
 from typing import TypeVar
 
+from google.protobuf.message import Message
+
+from service.scenes.shared_message import Encoder, SharedMessage
+
 _T = TypeVar("_T")
+
+Event = Message | SharedMessage
+"""What a stream sends."""
 
 HEARTBEAT = 15.0
 """Seconds without an event after which a heartbeat tells client and proxies that the stream is alive: a
@@ -53,3 +60,8 @@ async def with_idle_ticks(events: AsyncIterator[_T], interval: float) -> AsyncGe
             if pending is not None:  # a generator that is still running cannot be closed
                 pending.cancel()
                 await asyncio.gather(pending, return_exceptions=True)
+
+
+async def encoded(event: Event, encode: Encoder) -> bytes:
+    """Return an event as a transport sends it; an encoding that several streams send is made once."""
+    return await event.encoded(encode) if isinstance(event, SharedMessage) else encode(event)

@@ -18,19 +18,18 @@ import grpc
 from google.protobuf.message import Message
 from grpc import aio
 
-from cab.forecast.v1.consistency_service_pb2 import WatchSceneRequest
-from cab.forecast.v1.routes import PREDICT, SERVICES, WATCH_SCENE, Request, Response, Route
+from cab.forecast.v1.routes import PREDICT, SERVICES, Request, Response, Route
 from service.access.caller import Grant
 from service.errors import TooLarge
 from service.predict.dataplane import DataPlane
 from service.predict.request_reader import LARGE_BYTES, EncodedRequest, RequestLimits, read_protobuf
 from service.settings import Settings
 from service.telemetry.request_ids import HEADER, current_request_id
-from service.transports.calls import UNARY_METHODS, CallRecords, parse_message
+from service.transports.calls import STREAMS, UNARY_METHODS, CallRecords, parse_message
 from service.transports.grpc.gate import current_caller
 from service.transports.grpc.intake import Incoming
 from service.transports.grpc.status import abort
-from service.transports.streams import HEARTBEAT, with_idle_ticks
+from service.transports.streams import HEARTBEAT, Event, encoded, with_idle_ticks
 
 Context = Any  # grpc.aio.ServicerContext is generic in the message types, which are bytes here
 
@@ -48,8 +47,9 @@ class Handlers:
         """Return handlers for ``server.add_generic_rpc_handlers``, one per service."""
         handlers: dict[Route[Any, Any], grpc.RpcMethodHandler[bytes, bytes]] = {
             PREDICT: self._bytes(PREDICT, self._predict),
-            WATCH_SCENE: self._stream(WATCH_SCENE, self._watch_scene),
         }
+        for route, watch in STREAMS.items():
+            handlers[route] = self._stream(route, functools.partial(watch, self._dataplane))
         for route, execute in UNARY_METHODS.items():
             handlers[route] = self._unary(route, functools.partial(execute, self._dataplane))
         return [
@@ -65,9 +65,6 @@ class Handlers:
         call = incoming.hold(self._dataplane.accept(context.time_remaining(), grant))
         body = await self._read(incoming)
         return await self._dataplane.predict(EncodedRequest(body, self._read_request, LARGE_BYTES), call)
-
-    def _watch_scene(self, request: WatchSceneRequest) -> AsyncIterator[Message]:
-        return self._dataplane.consistency.watch_scene(request)
 
     def _bytes(
         self, route: Route[Any, Any], behavior: Callable[[Incoming, Grant, Context], Awaitable[Message]]
@@ -92,7 +89,7 @@ class Handlers:
         return self._bytes(route, parse_and_execute)
 
     def _stream(
-        self, route: Route[Request, Response], behavior: Callable[[Request], AsyncIterator[Message]]
+        self, route: Route[Request, Response], behavior: Callable[[Request], AsyncIterator[Event]]
     ) -> "grpc.RpcMethodHandler[bytes, bytes]":
         """Return the handler of a method that responds with a stream."""
 
@@ -133,13 +130,17 @@ def _handler(make: Any, handle: Callable[[Incoming, Context], Any]) -> "grpc.Rpc
     return handler
 
 
-async def _send(context: Context, message: Message) -> None:
+def _to_protobuf(message: Message) -> bytes:
+    return message.SerializeToString()
+
+
+async def _send(context: Context, event: Event) -> None:
     """Send one message of a stream.
 
     Raises:
         CancelledError: the client disconnected; gRPC notices this in a write before it cancels the call.
     """
     try:
-        await context.write(message.SerializeToString())
+        await context.write(await encoded(event, _to_protobuf))
     except aio.InternalError as error:
         raise asyncio.CancelledError from error

@@ -15,7 +15,7 @@ import functools
 import json
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import orjson
@@ -104,13 +104,20 @@ def from_document(message_type: type[_M], document: dict[str, Any]) -> _M:
     return message
 
 
-def read_query(message_type: type[_M], parameters: QueryParams) -> _M:
+def read_query(
+    message_type: type[_M], parameters: QueryParams, in_path: Mapping[str, str] | None = None
+) -> _M:
     """Return the message, of scalar fields, that the query of a URL describes.
+
+    Args:
+        message_type: the message.
+        parameters: the query.
+        in_path: fields that are in the path of the URL.
 
     Raises:
         BadField: a parameter is unknown, repeated or invalid; names it.
     """
-    document: dict[str, str] = {}
+    document: dict[str, str] = dict(in_path or {})
     for name, value in parameters.multi_items():
         if name in document:
             raise BadField(name, "is given more than once")

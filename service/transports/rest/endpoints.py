@@ -12,7 +12,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from cab.forecast.v1.routes import MODEL_SERVICE, PREDICT, WATCH_SCENE, Route
+from cab.forecast.v1.routes import MODEL_SERVICE, PREDICT, Route
 from service.access.caller import Grant
 from service.access.gate import Gate
 from service.access.scopes import scope_of
@@ -20,7 +20,7 @@ from service.errors import RequestTimeout, TooLarge
 from service.predict.dataplane import DataPlane
 from service.predict.request_reader import LARGE_BYTES, EncodedRequest, RequestLimits, read_protobuf
 from service.settings import Settings
-from service.transports.calls import UNARY_METHODS, CallRecorder, CallRecords, parse_message
+from service.transports.calls import STREAMS, UNARY_METHODS, CallRecorder, CallRecords, parse_message
 from service.transports.intake import Intake
 from service.transports.rest.codec import parse_json, read_query, read_request, to_json
 from service.transports.rest.negotiation import (
@@ -32,7 +32,7 @@ from service.transports.rest.negotiation import (
     timeout,
 )
 from service.transports.rest.problem import problem_response, to_problem
-from service.transports.streams import HEARTBEAT, with_idle_ticks
+from service.transports.streams import HEARTBEAT, Event, encoded, with_idle_ticks
 
 _SMALL_BYTES = 2**16
 """Limit of requests that hold no more than an id; they are parsed on the event loop."""
@@ -65,8 +65,9 @@ class Endpoints:
         """Return the endpoint of each route."""
         endpoints: dict[Route[Any, Any], Endpoint] = {
             PREDICT: self._recorded(PREDICT, self._predict),
-            WATCH_SCENE: self._watch_scene,
         }
+        for route in STREAMS:
+            endpoints[route] = functools.partial(self._watch, route)
         for route in UNARY_METHODS:
             endpoints[route] = self._recorded(route, functools.partial(self._execute, route))
         return endpoints
@@ -124,12 +125,12 @@ class Endpoints:
             message = read_query(route.request, request.query_params)
         return _message_response(await UNARY_METHODS[route](self._dataplane, message), outgoing)
 
-    async def _watch_scene(self, request: Request) -> Response:
-        def events() -> AsyncIterator[Message]:
-            message = read_query(WATCH_SCENE.request, request.query_params)
-            return self._dataplane.consistency.watch_scene(message)
+    async def _watch(self, route: Route[Any, Any], request: Request) -> Response:
+        def events() -> AsyncIterator[Event]:
+            message = read_query(route.request, request.query_params, request.path_params)
+            return STREAMS[route](self._dataplane, message)
 
-        return EventStreamResponse(self._records, self._gate, WATCH_SCENE, request, events)
+        return EventStreamResponse(self._records, self._gate, route, request, events)
 
     async def _read_body(self, request: Request, max_bytes: int) -> bytes:
         """Return the body; refuse one that is too large as soon as that is known.
@@ -175,7 +176,7 @@ class EventStreamResponse(Response):
         gate: Gate,
         route: Route[Any, Any],
         request: Request,
-        events: Callable[[], AsyncIterator[Message]],
+        events: Callable[[], AsyncIterator[Event]],
     ) -> None:
         """Create the response; the call starts when it is served.
 
@@ -231,11 +232,11 @@ class EventStreamResponse(Response):
         try:
             events = with_idle_ticks(self._events(), HEARTBEAT)
             async with deadline, aclosing(events):
-                async for message in events:
-                    if message is None:
+                async for event in events:
+                    if event is None:
                         await writer.write(b": heartbeat\n\n")
                     else:
-                        await writer.write(b"data: " + to_json(message) + b"\n\n")
+                        await writer.write(await encoded(event, _to_event))
         except TimeoutError:
             if not deadline.expired():
                 raise
@@ -307,6 +308,10 @@ async def cancel_on_disconnect(receive: Receive, work: Awaitable[_T]) -> _T:
 async def _wait_for_disconnect(receive: Receive) -> None:
     while (await receive())["type"] != "http.disconnect":
         pass
+
+
+def _to_event(message: Message) -> bytes:
+    return b"data: " + to_json(message) + b"\n\n"
 
 
 def _message_response(message: Message, outgoing: Format) -> Response:

@@ -4,8 +4,12 @@ from collections.abc import Callable
 from importlib import metadata
 from typing import Any
 
+from google.protobuf.message import Message
+
 from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
 from cab.forecast.v1 import model_service_pb2 as models_pb
+from cab.forecast.v1 import prediction_service_pb2 as predict_pb
+from cab.forecast.v1 import scene_service_pb2 as scenes_pb
 from cab.forecast.v1.bounds import STEP_SECONDS
 from cab.forecast.v1.routes import (
     GET_MODEL,
@@ -13,6 +17,7 @@ from cab.forecast.v1.routes import (
     RELOAD_MODELS,
     RESET_SCENE,
     ROUTES,
+    WATCH_FORECASTS,
     WATCH_SCENE,
     Route,
 )
@@ -33,6 +38,7 @@ Errors are `application/problem+json` (RFC 9457), with a machine-readable `reaso
 _BINARY = {"schema": {"type": "string", "format": "binary"}}
 
 _NOW = 1_700_000_000.0
+_MODEL = models_pb.ModelReference(name="kalman", version="1.0.0", protocol=models_pb.INPUT_PROTOCOL_CAUSAL)
 _FRAMES = 9
 EXAMPLE_IDS = {"scene_id": "street-1", "agent_id": "car-1"}
 """The scene that one of the examples names, and an agent of it."""
@@ -80,7 +86,7 @@ def _operation(route: Route[Any, Any], settings: Settings) -> Schema:
     text = comments()[f"{route.service.rpartition('.')[2]}.{route.method}"]
     response = route.response.DESCRIPTOR.name
     content = (
-        _event_content(response)
+        _event_content(route)
         if route.streaming
         else {Format.JSON.value: {"schema": reference(response)}, Format.PROTOBUF.value: _BINARY}
     )
@@ -126,19 +132,19 @@ def _parameters(route: Route[Any, Any], settings: Settings) -> list[Schema]:
     if route.verb == "POST":
         return []
     parameters = query_parameters(route.request.DESCRIPTOR, settings, EXAMPLE_IDS | {"window": 2.0})
-    if route is WATCH_SCENE:
+    for parameter in parameters:
+        if f"{{{parameter['name']}}}" in route.path:
+            parameter["in"] = "path"
+    if route.streaming:
         parameters.append(
             _timeout_parameter("Seconds after which the stream ends; without this header it goes on.")
         )
     return parameters
 
 
-def _event_content(message: str) -> Schema:
-    """Return the content of a response of Server-Sent Events.
-
-    Args:
-        message: name of the message in each event.
-    """
+def _event_content(route: Route[Any, Any]) -> Schema:
+    """Return the content of a method's response of Server-Sent Events."""
+    message = route.response.DESCRIPTOR.name
     data = {
         "type": "string",
         "contentMediaType": Format.JSON.value,
@@ -152,7 +158,8 @@ def _event_content(message: str) -> Schema:
         "properties": {"event": {"type": "string", "enum": ["message", "error"]}, "data": data},
         "required": ["data"],
     }
-    return {EVENT_STREAM: {"schema": schema, "example": _event_example()}}
+    example = {"event": "message", "data": to_json(_EVENT_EXAMPLES[route]()).decode()}
+    return {EVENT_STREAM: {"schema": schema, "example": example}}
 
 
 def _timeout_parameter(description: str) -> Schema:
@@ -277,23 +284,47 @@ _EXAMPLES: dict[Route[Any, Any], Callable[[], dict[str, dict[str, Any]]]] = {
 }
 
 
-def _event_example() -> dict[str, str]:
+def _scene_example() -> consistency_pb.WatchSceneResponse:
     """Return an example event of WatchScene."""
     instant = consistency_pb.InstantConsistency(
         agent_id=EXAMPLE_IDS["agent_id"],
         time=_NOW,
-        model=models_pb.ModelReference(
-            name="kalman", version="1.0.0", protocol=models_pb.INPUT_PROTOCOL_CAUSAL
-        ),
+        model=_MODEL,
         errors=[
             consistency_pb.AgeError(age=0.5, displacement_error=0.12, most_likely_was_nearest=True),
             consistency_pb.AgeError(age=1.0, displacement_error=0.31, most_likely_was_nearest=True),
         ],
     )
-    return {
-        "event": "message",
-        "data": to_json(consistency_pb.WatchSceneResponse(instants=[instant])).decode(),
-    }
+    return consistency_pb.WatchSceneResponse(instants=[instant])
+
+
+def _forecasts_example() -> scenes_pb.WatchForecastsResponse:
+    """Return an example event of WatchForecasts: one car, two steps ahead."""
+    frame = scenes_pb.ForecastFrame(
+        scene_id=EXAMPLE_IDS["scene_id"],
+        time=_NOW,
+        model=_MODEL,
+        inference_seconds=0.002,
+        steps=2,
+        step=STEP_SECONDS,
+    )
+    frame.agents.add(
+        id=EXAMPLE_IDS["agent_id"],
+        type=models_pb.AGENT_TYPE_VEHICLE,
+        predicted=True,
+        status=predict_pb.FORECAST_STATUS_OK,
+        states=[predict_pb.AgentState(time=_NOW, x=100.0, y=50.0, velocity_x=8.0, velocity_y=0.0)],
+        weights=[1.0],
+        means=[104.0, 50.0, 108.0, 50.0],
+        covariances=[0.04, 0.0, 0.02, 0.12, 0.0, 0.06],
+    )
+    return scenes_pb.WatchForecastsResponse(frame=frame)
+
+
+_EVENT_EXAMPLES: dict[Route[Any, Any], Callable[[], Message]] = {
+    WATCH_SCENE: _scene_example,
+    WATCH_FORECASTS: _forecasts_example,
+}
 
 
 def _agent(agent_id: str, kind: str, x: float, y: float, speed: float) -> dict[str, Any]:

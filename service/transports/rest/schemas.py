@@ -37,6 +37,7 @@ REQUIRED = {
     "GetSceneConsistencyRequest": ["scene_id"],
     "ResetSceneRequest": ["scene_id"],
     "WatchSceneRequest": ["scene_id"],
+    "WatchForecastsRequest": ["scene_id"],
 }
 """Required fields by message. Descriptors cannot tell; the comments of the contract say it in words."""
 ALTERNATIVES = {
@@ -120,6 +121,7 @@ def bounds(settings: Settings) -> dict[str, Schema]:
         "GetSceneConsistencyRequest.scene_id": an_id,
         "ResetSceneRequest.scene_id": an_id,
         "WatchSceneRequest.scene_id": an_id,
+        "WatchForecastsRequest.scene_id": an_id,
     }
 
 
@@ -131,6 +133,8 @@ def message_schemas(settings: Settings) -> dict[str, Schema]:
     responses = [route.response for route in ROUTES]
     for roots, are_requests in ((requests, True), (responses, False)):
         for descriptor in _reachable(root.DESCRIPTOR for root in roots):
+            if descriptor.name in schemas:  # what requests may hold is the stricter description
+                continue
             schemas[descriptor.name] = _message(descriptor, are_requests, limits)
             for field in descriptor.fields:
                 if field.enum_type is not None:

@@ -86,7 +86,9 @@ def build_app(
         )
     records = CallRecords("rest", metrics, settings, tracing)
     for route, endpoint in Endpoints(dataplane, records, settings, intake, gate).by_route().items():
-        app.add_route(route.path, endpoint, methods=[route.verb])
+        # A scene's id may hold slashes
+        path = route.path.replace("{scene_id}", "{scene_id:path}")
+        app.add_route(path, endpoint, methods=[route.verb])
 
     async def show_metrics(request: Request) -> Response:
         if tracing is not None:  # only OpenMetrics has exemplars

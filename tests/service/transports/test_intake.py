@@ -39,6 +39,11 @@ def refused(server: Server, reason: str) -> float:
     return server.metrics.registry.get_sample_value("forecast_refused_total", {"reason": reason}) or 0.0
 
 
+def watchers(server: Server) -> float:
+    """Return the number of open streams of WatchScene."""
+    return server.metrics.registry.get_sample_value("forecast_watchers", {"method": "WatchScene"}) or 0.0
+
+
 @asynccontextmanager
 async def connected(address: str, sent: Sequence[bytes]) -> AsyncIterator[list[Connection]]:
     """Open one connection for each of the given bytes, and send them."""
@@ -161,13 +166,13 @@ async def test_streams_have_a_bound_of_their_own() -> None:
     async with started(max_concurrent_calls=1, max_watchers=2) as server:
         call = grpc_call(3, body=b"\x0a\x01s", method=path)
         async with connected(server.grpc_address, [call]), connected(server.http_address, [watch]):
-            await until(lambda: server.dataplane.consistency._watchers == 2)
+            await until(lambda: watchers(server) == 2)
             await check_answers(server)
             async with connected(server.http_address, [watch]) as [third]:
                 assert await status(third) == 429
         assert refused(server, "watchers") == 1
         assert refused(server, "concurrency") == 0
-        await until(lambda: server.dataplane.consistency._watchers == 0)
+        await until(lambda: watchers(server) == 0)
 
 
 async def test_bodies_of_known_length_are_counted_before_they_arrive() -> None:

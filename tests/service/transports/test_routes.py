@@ -6,6 +6,7 @@ from cab.forecast.v1 import admin_service_pb2 as admin_pb
 from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
+from cab.forecast.v1 import scene_service_pb2 as scenes_pb
 from cab.forecast.v1.routes import (
     GET_AGENT_CONSISTENCY,
     GET_MODEL,
@@ -21,7 +22,13 @@ from service.transports.rest.endpoints import Endpoints
 from service.transports.rest.openapi import openapi_document
 from tests.service.servers import settings
 
-FILES = (pb.DESCRIPTOR, models_pb.DESCRIPTOR, consistency_pb.DESCRIPTOR, admin_pb.DESCRIPTOR)
+FILES = (
+    pb.DESCRIPTOR,
+    models_pb.DESCRIPTOR,
+    consistency_pb.DESCRIPTOR,
+    scenes_pb.DESCRIPTOR,
+    admin_pb.DESCRIPTOR,
+)
 
 
 def test_routes_are_the_contracts_methods() -> None:

@@ -33,6 +33,12 @@ from cab.forecast.v1.model_service_pb2 import (
     ListModelsResponse,
 )
 from cab.forecast.v1.prediction_service_pb2 import PredictRequest, PredictResponse
+from cab.forecast.v1.scene_service_pb2 import (
+    ListScenesRequest,
+    ListScenesResponse,
+    WatchForecastsRequest,
+    WatchForecastsResponse,
+)
 
 Request = TypeVar("Request", bound=Message)
 Response = TypeVar("Response", bound=Message)
@@ -40,8 +46,9 @@ Response = TypeVar("Response", bound=Message)
 PREDICTION_SERVICE = "cab.forecast.v1.PredictionService"
 MODEL_SERVICE = "cab.forecast.v1.ModelService"
 CONSISTENCY_SERVICE = "cab.forecast.v1.ConsistencyService"
+SCENE_SERVICE = "cab.forecast.v1.SceneService"
 ADMIN_SERVICE = "cab.forecast.v1.AdminService"
-SERVICES = (PREDICTION_SERVICE, MODEL_SERVICE, CONSISTENCY_SERVICE, ADMIN_SERVICE)
+SERVICES = (PREDICTION_SERVICE, MODEL_SERVICE, CONSISTENCY_SERVICE, SCENE_SERVICE, ADMIN_SERVICE)
 """Full names of all gRPC services of the contract."""
 
 _PATH_PARAMETER = re.compile(r"\{(\w+)\}")
@@ -135,6 +142,18 @@ RESET_SCENE: Route[ResetSceneRequest, ResetSceneResponse] = Route(
     ResetSceneRequest,
     ResetSceneResponse,
 )
+LIST_SCENES: Route[ListScenesRequest, ListScenesResponse] = Route(
+    SCENE_SERVICE, "ListScenes", "GET", "/v1/scenes", ListScenesRequest, ListScenesResponse
+)
+WATCH_FORECASTS: Route[WatchForecastsRequest, WatchForecastsResponse] = Route(
+    SCENE_SERVICE,
+    "WatchForecasts",
+    "GET",
+    "/v1/scenes/{scene_id}/forecasts/watch",
+    WatchForecastsRequest,
+    WatchForecastsResponse,
+    streaming=True,
+)
 RELOAD_MODELS: Route[ReloadModelsRequest, ReloadModelsResponse] = Route(
     ADMIN_SERVICE,
     "ReloadModels",
@@ -154,6 +173,8 @@ ROUTES: tuple[Route[Any, Any], ...] = (
     LIST_MODEL_CONSISTENCY,
     WATCH_SCENE,
     RESET_SCENE,
+    LIST_SCENES,
+    WATCH_FORECASTS,
     RELOAD_MODELS,
 )
 """All methods of the contract."""

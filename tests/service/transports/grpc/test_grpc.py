@@ -21,6 +21,7 @@ SERVICES = [
     "cab.forecast.v1.PredictionService",
     "cab.forecast.v1.ModelService",
     "cab.forecast.v1.ConsistencyService",
+    "cab.forecast.v1.SceneService",
     "cab.forecast.v1.AdminService",
 ]
 

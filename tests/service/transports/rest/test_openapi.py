@@ -10,6 +10,7 @@ from cab.forecast.v1 import admin_service_pb2 as admin_pb
 from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
+from cab.forecast.v1 import scene_service_pb2 as scenes_pb
 from service.settings import Settings
 from service.tracking.store.base import WINDOW
 from service.transports.rest.codec import to_dict
@@ -18,7 +19,13 @@ from service.transports.rest.schemas import ALTERNATIVES, REQUIRED, bounds, comm
 from tests.service.fakes import FakeForecaster
 from tests.service.servers import running
 
-FILES = (pb.DESCRIPTOR, models_pb.DESCRIPTOR, consistency_pb.DESCRIPTOR, admin_pb.DESCRIPTOR)
+FILES = (
+    pb.DESCRIPTOR,
+    models_pb.DESCRIPTOR,
+    consistency_pb.DESCRIPTOR,
+    scenes_pb.DESCRIPTOR,
+    admin_pb.DESCRIPTOR,
+)
 DOCUMENT = openapi_document(Settings())
 SCHEMAS: dict[str, Any] = DOCUMENT["components"]["schemas"]
 

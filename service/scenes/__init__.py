@@ -1,0 +1,1 @@
+"""Live scenes: which there are, and what watchers get of their forecasts."""
