@@ -107,6 +107,10 @@ class Settings(BaseSettings):
     """Origins whose web pages may call REST, for example ``https://tools.example.com``; comma-separated in
     the environment; not set: no pages of other origins may."""
 
+    console: bool | None = None
+    """Flag for the live console at / of REST; where there are keys it asks for one with the scope ``read``.
+    Not set: on, unless other machines can reach the server and it has no keys."""
+
     max_agents: int = Field(default=512, ge=1)
     """Max number of agents of a request."""
     max_states: int = Field(default=512, ge=1)

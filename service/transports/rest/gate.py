@@ -1,4 +1,5 @@
-"""Access to what REST serves beside the contract: metrics and documentation need a key, probes do not."""
+"""Access to what REST serves beside the contract: metrics and documentation need a key; probes and the files
+of the console do not."""
 
 from contextlib import ExitStack
 
@@ -8,15 +9,17 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from service.access.gate import Gate
 from service.access.scopes import Scope as KeyScope
 from service.errors import ServiceError, Unauthenticated
+from service.transports.rest.console import CONSOLE_PATH, ROOT_PATH
 from service.transports.rest.problem import problem_response
 
 LIVE_PATH = "/livez"
 READY_PATH = "/readyz"
 METRICS_PATH = "/metrics"
-_OPEN = frozenset((LIVE_PATH, READY_PATH))
-"""Paths for everyone: orchestrators probe without credentials."""
-_CONTRACT = "/v1/"
-"""Beginning of the contract's paths, whose endpoints authenticate by themselves, and record the call."""
+_OPEN = frozenset((LIVE_PATH, READY_PATH, ROOT_PATH))
+"""Paths for everyone: orchestrators probe without credentials, and the root says where to find what."""
+_OPEN_FOLDERS = ("/v1/", CONSOLE_PATH)
+"""Beginnings of the contract's paths, whose endpoints authenticate by themselves and record the call, and of
+the console's files."""
 _CHALLENGE = {"WWW-Authenticate": 'Basic realm="cab-forecast", charset="UTF-8", Bearer'}
 """Challenge for pages that people open in a browser, which then asks for the key as a password."""
 
@@ -31,7 +34,7 @@ class GateMiddleware:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
         path: str = scope["path"]
-        if path in _OPEN or path.startswith(_CONTRACT):
+        if path in _OPEN or path.startswith(_OPEN_FOLDERS):
             await self._app(scope, receive, send)
             return
         with ExitStack() as stack:

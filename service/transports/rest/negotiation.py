@@ -69,6 +69,12 @@ def check_events_accepted(headers: Headers) -> None:
         raise NotAcceptable(f"responses are available as {EVENT_STREAM}")
 
 
+def prefers_html(headers: Headers) -> bool:
+    """Return whether the client wants a page rather than JSON, as browsers do."""
+    ranges = _media_ranges(headers)
+    return _quality("text/html", ranges) > _quality(Format.JSON.value, ranges)
+
+
 def timeout(headers: Headers) -> float | None:
     """Return the seconds that the client waits for the response; None if it does not say.
 

@@ -31,6 +31,7 @@ from service.telemetry.tracing import Tracing
 from service.transports.calls import CallRecords, to_service_error
 from service.transports.intake import Intake
 from service.transports.rest.connections import BoundedProtocol, Connections
+from service.transports.rest.console import add_root
 from service.transports.rest.endpoints import Endpoints, ExitStackMiddleware
 from service.transports.rest.gate import LIVE_PATH, METRICS_PATH, READY_PATH, GateMiddleware
 from service.transports.rest.handshake import Handshake
@@ -98,6 +99,7 @@ def build_app(
 
     app.add_route(METRICS_PATH, show_metrics, methods=["GET"])
     _add_probes(app, dataplane)
+    add_root(app, settings, closed=gate.closed)
     return app
 
 
