@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict
 
-from model.arrays import Ints
+from model.arrays import Bools, Ints
 from model.mixture import TrajectoryMixture
 from model.scenes.raster import MapView, cut_views
 from model.scenes.scene import STEP_SECONDS, AgentType, Scene
@@ -169,6 +169,19 @@ class Forecaster(ABC):
     def looks_at_far_map(self, agent_type: AgentType) -> bool:
         """Return whether forecasts of agents of that type also depend on the far map patch."""
         return False
+
+    def sees(self, scene: Scene, targets: Ints) -> Bools:
+        """Return which agents of the scene can change the forecasts of n others as neighbours: [n, N].
+
+        Args:
+            scene: the scene.
+            targets: as for ``prepare``.
+        """
+        kinds = self.info.context_types if self.info.uses_neighbors else ()
+        seen = np.array([kind in kinds for kind in scene.types], dtype=np.bool_)
+        seen &= scene.states.observed[:, -1]
+        others = targets[:, None] != np.arange(len(scene.types))[None]
+        return np.asarray(seen[None] & others)
 
     def __call__(
         self, scene: Scene, targets: Ints, context: Context = Context.FULL, steps: int | None = None

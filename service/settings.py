@@ -126,6 +126,11 @@ class Settings(BaseSettings):
     max_response_bytes: int = Field(default=32 * 2**20, ge=1024)
     """Max size of the samples of a response, as protobuf; they take up to three times as much as JSON."""
 
+    max_explained_agents: int = Field(default=16, ge=1)
+    """Max number of agents that one call of Explain explains; more may be neighbours."""
+    max_explanation_forecasts: int = Field(default=8192, ge=1)
+    """Max number of forecasts that are made for one call of Explain."""
+
     max_batch_agents: int = Field(default=256, ge=1)
     """Max number of agents in one forward."""
     max_queue_agents: int = Field(default=2048, ge=1)

@@ -14,19 +14,11 @@ import numpy as np
 
 from benchmark.context.moves import Move, Pose
 from benchmark.plan import HISTORY_FRAMES, PlannedScene
-from model.arrays import Bools, Floats, Ints
-from model.geometry import rotate
+from model.arrays import Floats, Ints
+from model.explanation.matching import NEIGHBORS_M, alike, overlaps
 from model.metrics.offroad import driveable
 from model.scenes.scene import STEP_SECONDS
 
-LIKE_SPEED: Final = 1.0
-"""m/s by which the speeds of agent and donor may differ."""
-NEIGHBORS_M: Final = 60.0
-"""Distance within which neighbours are exchanged, m."""
-LENGTH_M: Final = 5.0
-"""m along the agent, between centres, within which a neighbour may overlap with it."""
-WIDTH_M: Final = 2.0
-"""m across the agent, likewise."""
 TRIES: Final = 200
 """Candidates that are tried for an agent."""
 
@@ -155,7 +147,7 @@ class DonorPool:
     def _candidates(self, number: int, purpose: int) -> Iterator[int]:
         """Yield agents of other scenes and a like speed, in random order."""
         agent = self.agents[number]
-        like: Bools = np.abs(self._speeds - agent.speed) <= LIKE_SPEED  # never for an unknown speed
+        like = alike(self._speeds, agent.speed)
         others = np.flatnonzero(like & (self._scene_of != agent.scene))
         yield from self.random(number, purpose).permutation(others)[:TRIES].tolist()
 
@@ -164,10 +156,8 @@ class DonorPool:
         donor, tracks = self.agents[candidate], self.neighbors(candidate)
         record = self.scenes[donor.scene].record
         seen = np.stack([record.tracks[track].positions(donor.frame + _BACK) for track in tracks])
-        offset = Move(donor.pose, agent.pose).points(seen) - agent.past
-        ahead, left = np.moveaxis(np.abs(rotate(offset, -agent.past_heading)), -1, 0)
-        overlaps = ((ahead < LENGTH_M) & (left < WIDTH_M)).any(axis=1)  # NaN does not
-        free: Ints = tracks[~overlaps]
+        moved = Move(donor.pose, agent.pose).points(seen)
+        free: Ints = tracks[~overlaps(moved, agent.past, agent.past_heading)]
         return free
 
 

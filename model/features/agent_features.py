@@ -1,5 +1,7 @@
 """The tensors that a network of the agent's frame takes of a scene."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 
@@ -82,6 +84,31 @@ def _histories(states: AgentStates, targets: Ints) -> Floats:
     return histories
 
 
+def seen_in_agent_frame(scene: Scene, targets: Ints, types: Sequence[AgentType]) -> Bools:
+    """Return which agents of the scene n agents can have as neighbours in ``agent_frame_features``: [n, N].
+
+    Of more than ``NEIGHBORS`` only the nearest are taken.
+    """
+    others = np.flatnonzero([kind in types for kind in scene.types])
+    mask = np.zeros((len(targets), len(scene.types)), dtype=np.bool_)
+    mask[:, others] = _places(scene.states, targets, others)[2]
+    return mask
+
+
+def _places(states: AgentStates, targets: Ints, others: Ints) -> tuple[Floats, Floats, Bools]:
+    """Return where n agents see m others, how far away, and whether as neighbours.
+
+    Returns:
+        [n, m, 2], m ahead and to the left; [n, m], m, NaN where not observed now; [n, m].
+    """
+    own = states.heading[targets, -1][:, None]
+    place = rotate(states.position[others, -1][None] - states.position[targets, -1][:, None], -own)
+    distance = np.hypot(place[..., 0], place[..., 1])
+    with np.errstate(invalid="ignore"):
+        seen: Bools = (distance <= NEIGHBOR_REACH_M) & (targets[:, None] != others[None])
+    return place, distance, seen
+
+
 def _neighbors(scene: Scene, targets: Ints, types: tuple[AgentType, ...]) -> Floats:
     """Return the neighbours of n agents: [n, M, 11]."""
     states = scene.states
@@ -89,10 +116,7 @@ def _neighbors(scene: Scene, targets: Ints, types: tuple[AgentType, ...]) -> Flo
     if not (len(others) and len(targets)):
         return np.zeros((len(targets), NEIGHBORS, NEIGHBOR_FEATURES))
     own = states.heading[targets, -1][:, None]
-    place = rotate(states.position[others, -1][None] - states.position[targets, -1][:, None], -own)
-    distance = np.hypot(place[..., 0], place[..., 1])  # NaN where not observed now
-    with np.errstate(invalid="ignore"):
-        seen: Bools = (distance <= NEIGHBOR_REACH_M) & (targets[:, None] != others[None])
+    place, distance, seen = _places(states, targets, others)
 
     def in_own_frame(vectors: Floats) -> Floats:
         return rotate(known_or_zero(vectors[others, -1])[None], -own)

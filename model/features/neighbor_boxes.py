@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from model.arrays import Float32s, Floats, Ints
+from model.arrays import Bools, Float32s, Floats, Ints
 from model.geometry import nearest_rows, rotate, wrap_angle
 from model.scenes.raster import COLUMNS_RIGHT, PATCH_PIXELS_PER_METER, PATCH_SIZE, ROWS_BEHIND
 from model.scenes.scene import AgentType, Scene
@@ -39,16 +39,35 @@ def neighbor_boxes(scene: Scene, targets: Ints, types: Sequence[AgentType]) -> F
     others = np.flatnonzero([kind in types for kind in scene.types])
     if not (len(others) and len(targets)):
         return np.zeros((len(targets), BOXES, BOX_NUMBERS), dtype=np.float32)
-    position, heading = scene.states.position[:, -1], scene.states.heading[:, -1]
-    offset = position[others][None] - position[targets][:, None]
-    place = rotate(offset, -heading[targets][:, None])  # NaN where not observed now
+    heading = scene.states.heading[:, -1]
+    place, seen = _places(scene, targets, others)
     turn = np.nan_to_num(wrap_angle(heading[others][None] - heading[targets][:, None]))
     size = np.array([BOX_SIZE[scene.types[other]] for other in others.tolist()])
     boxes: Floats = np.concatenate(
         [place, turn[..., None], np.broadcast_to(size, place.shape)], axis=-1
     )  # [n, m, 5]
-    with np.errstate(invalid="ignore"):
-        seen = ((place > _LOW) & (place < _HIGH)).all(axis=-1)
-    seen &= targets[:, None] != others[None, :]
     distance = np.hypot(place[..., 0], place[..., 1])
     return nearest_rows(boxes, distance, seen, BOXES).astype(np.float32)
+
+
+def seen_as_boxes(scene: Scene, targets: Ints, types: Sequence[AgentType]) -> Bools:
+    """Return which agents of the scene n agents can have among their ``neighbor_boxes``: [n, N]."""
+    others = np.flatnonzero([kind in types for kind in scene.types])
+    mask = np.zeros((len(targets), len(scene.types)), dtype=np.bool_)
+    mask[:, others] = _places(scene, targets, others)[1]
+    return mask
+
+
+def _places(scene: Scene, targets: Ints, others: Ints) -> tuple[Floats, Bools]:
+    """Return where n agents see m others, m ahead and to the left, NaN where not observed now; and whether.
+
+    Returns:
+        [n, m, 2]; [n, m].
+    """
+    position, heading = scene.states.position[:, -1], scene.states.heading[:, -1]
+    offset = position[others][None] - position[targets][:, None]
+    place = rotate(offset, -heading[targets][:, None])
+    with np.errstate(invalid="ignore"):
+        seen: Bools = np.asarray(((place > _LOW) & (place < _HIGH)).all(axis=-1))
+    seen &= targets[:, None] != others[None, :]
+    return place, seen

@@ -3,9 +3,9 @@
 import numpy as np
 import torch
 
-from model.arrays import Float32s, Floats, Ints
-from model.features.agent_features import agent_frame_view
-from model.features.neighbor_boxes import neighbor_boxes
+from model.arrays import Bools, Float32s, Floats, Ints
+from model.features.agent_features import agent_frame_view, seen_in_agent_frame
+from model.features.neighbor_boxes import neighbor_boxes, seen_as_boxes
 from model.features.neighbors import edge_ramps, neighbor_sums
 from model.features.spec import FeatureSpec, Frame
 from model.features.standardization import HEADING, state_scale, state_vectors
@@ -40,6 +40,26 @@ def network_view(
     if spec.frame is Frame.AGENT:
         return agent_frame_view(scene, targets, spec, context)
     return _ground_frame_view(scene, targets, agent_type, spec, context)
+
+
+def seen_neighbors(scene: Scene, targets: Ints, agent_type: AgentType, spec: FeatureSpec) -> Bools:
+    """Return which agents of the scene can change the features of n agents of one type: [n, N].
+
+    Args:
+        scene: the agents.
+        targets: [n], indices of agents of that type.
+        agent_type: the type.
+        spec: the features.
+    """
+    if spec.frame is Frame.AGENT:
+        return seen_in_agent_frame(scene, targets, spec.neighbor_types)
+    if spec.neighbor_boxes:
+        return seen_as_boxes(scene, targets, spec.neighbor_types)
+    seen = np.zeros((len(targets), len(scene.types)), dtype=np.bool_)
+    for other in spec.neighbor_types:
+        neighbors = np.flatnonzero(scene.of_type(other))
+        seen[:, neighbors] = edge_ramps(scene.states, targets, agent_type, neighbors, other) > 0
+    return seen
 
 
 def ground_frame_features(

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from model.arrays import Ints
-from model.features.scene_features import network_view
+from model.arrays import Bools, Ints
+from model.features.scene_features import network_view, seen_neighbors
 from model.features.spec import Frame
 from model.forecaster import Context, Features, Forecaster, ModelInfo, Prepared, complete
 from model.mixture import TrajectoryMixture
@@ -116,6 +116,12 @@ class NetworkForecaster(Forecaster, Generic[SomeNetworks]):
         if self.requires_heading(agent_type) and np.isnan(states.heading[targets, -1]).any():
             raise ValueError("an agent to be forecast has no heading")
         return network_view(replace(scene, states=states), targets, agent_type, self._spec, context)
+
+    def sees(self, scene: Scene, targets: Ints) -> Bools:
+        states = scene.states.last_frames(self.info.history_frames)
+        return seen_neighbors(
+            replace(scene, states=states), targets, scene.types[int(targets[0])], self._spec
+        )
 
     @torch.inference_mode()
     def forecast(

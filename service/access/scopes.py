@@ -5,6 +5,7 @@ from enum import StrEnum
 from typing import Any
 
 from cab.forecast.v1.routes import (
+    EXPLAIN,
     GET_AGENT_CONSISTENCY,
     GET_MODEL,
     GET_SCENE_CONSISTENCY,
@@ -25,7 +26,7 @@ class Scope(StrEnum):
     """Rights of a key."""
 
     PREDICT = "predict"
-    """Forecasts."""
+    """Forecasts and explanations."""
     READ = "read"
     """Consistency of agents, scenes and models; live scenes and their forecasts."""
     RESET = "reset"
@@ -38,6 +39,7 @@ class Scope(StrEnum):
 
 _SCOPES: Mapping[Route[Any, Any], Scope | None] = {
     PREDICT: Scope.PREDICT,
+    EXPLAIN: Scope.PREDICT,
     LIST_MODELS: None,
     GET_MODEL: None,
     GET_VERSION: None,

@@ -6,6 +6,7 @@ alone, under heavy load batches grow by themselves. The most urgent work goes fi
 """
 
 import asyncio
+import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
@@ -33,6 +34,8 @@ _CUT_IN_THREADS = 8
 """Agents of a batch from which on map patches are cut in several threads."""
 _SPARE_SECONDS = 0.01
 """Seconds that a forward outside the queue may be expected to take."""
+_POLL = 0.002
+"""Seconds between looks at whether the model is free."""
 
 
 @dataclass(frozen=True)
@@ -206,6 +209,19 @@ class Batcher:
     def is_free(self) -> bool:
         """True if no call waits for the model or is in it."""
         return not (self._running or self._admission.waiting or self._queue)
+
+    async def until_free(self, until: float = math.inf) -> bool:
+        """Wait until no call waits for the model or is in it, and return True.
+
+        Args:
+            until: time on the event loop's clock at which the wait ends, and the result is False.
+        """
+        loop = asyncio.get_running_loop()
+        while not self.is_free:
+            if loop.time() > until:
+                return False
+            await asyncio.sleep(_POLL)
+        return True
 
     def spare_parts(self, job: Job) -> list[Job]:
         """Return a job in parts so small that calls which arrive meanwhile hardly wait, for ``run_spare``."""

@@ -7,6 +7,7 @@ from typing import Protocol as Interface
 import structlog
 
 from cab.forecast.v1 import model_service_pb2 as pb
+from model.explanation.donors import Donors
 from model.forecaster import Forecaster, ModelInfo, Protocol
 from model.registry import UnknownModelError
 from model.scenes.scene import STEP_SECONDS, AgentType
@@ -53,6 +54,8 @@ class Catalog:
     """All models by "name" and by "name@version"."""
     default_by_caller: Mapping[str, Forecaster] = field(default_factory=dict)
     """Defaults of some callers, by the name of their key."""
+    donors: Donors | None = None
+    """What stands for absent parts in explanations; None: the null context."""
 
     def get(self, name: str, caller: str | None = None) -> Forecaster:
         """Return a model by "name" or "name@version"; the caller's default for the empty name.

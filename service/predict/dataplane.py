@@ -15,6 +15,7 @@ from service.lifecycle import Lifecycle, Phase
 from service.predict.admission import Admission
 from service.predict.batcher import Batcher
 from service.predict.catalog import Catalog, reference
+from service.predict.explanation import Explainer
 from service.predict.pipeline import Pipeline
 from service.predict.publisher import Publisher
 from service.predict.rasters.library import RasterLibrary
@@ -103,6 +104,9 @@ class DataPlane:
             self._pipeline.shadow = Shadow(
                 name, share, settings, metrics, self._batcher, shadow_tracker, self._publisher
             )
+        self._explainer = Explainer(
+            settings, metrics, self._lifecycle, self._batcher, self._rasters, self._threads
+        )
         self._reloader: Reloader | None = None
         self._reloads: set[asyncio.Task[admin_pb.ReloadModelsResponse]] = set()
         self._following: asyncio.Task[None] | None = None
@@ -110,6 +114,10 @@ class DataPlane:
         """See ``Pipeline.accept``."""
         self.predict = self._pipeline.predict
         """See ``Pipeline.predict``."""
+        self.accept_explanation = self._explainer.accept
+        """See ``Explainer.accept``."""
+        self.explain = self._explainer.explain
+        """See ``Explainer.explain``."""
 
     @property
     def phase(self) -> Phase:
@@ -193,7 +201,7 @@ class DataPlane:
 
     def _take_over(self, catalog: Catalog) -> None:
         self._references.set_loaded(reference(info) for info in catalog.models.infos())
-        self._pipeline.catalog = catalog
+        self._pipeline.catalog = self._explainer.catalog = catalog
         if self._pipeline.shadow is not None:
             self._pipeline.shadow.set_catalog(catalog)
 

@@ -10,6 +10,8 @@ import structlog
 from packaging.version import Version
 
 from model.checkpoint import CONFIG_FILE, TENSORS_FILE, load_checkpoint
+from model.explanation.donors import FILE as DONORS_FILE
+from model.explanation.donors import Donors, DonorsError, load_donors
 from model.forecaster import Forecaster, ModelInfo, Protocol
 from model.registry import DuplicateModelError, Registry, baselines, checkpoint_folders
 from service.predict.canary import check
@@ -19,7 +21,7 @@ from service.settings import Engine, Settings, SettingsError, bundled_models
 _log = structlog.get_logger(__name__)
 
 Fingerprint: TypeAlias = frozenset[tuple[str, int, int]]
-"""Path, size and time of change of each file of the checkpoints in a folder."""
+"""Path, size and time of change of each file of the checkpoints in a folder, and of its donors."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,7 @@ class FolderModels(Registry):
         standing: the baselines.
         sources: the checkpoints by folder.
         refused: the checkpoints that cannot be served.
+        donors: what stands for absent parts in explanations; None: the folder has none.
 
     Raises:
         DuplicateModelError: a checkpoint has the name and version of a baseline.
@@ -61,6 +64,7 @@ class FolderModels(Registry):
         standing: Iterable[Forecaster],
         sources: Mapping[Path, Source],
         refused: Iterable[RefusedModel] = (),
+        donors: Donors | None = None,
     ) -> None:
         self.standing = tuple(standing)
         self.sources = dict(sources)
@@ -68,6 +72,7 @@ class FolderModels(Registry):
         passed_over = [source.info for source in sources.values() if source.forecaster is None]
         super().__init__([*self.standing, *loaded], passed_over)
         self.refused = tuple(refused)
+        self.donors = donors
 
 
 def models_folder(settings: Settings) -> Path | None:
@@ -121,7 +126,7 @@ def load_models(settings: Settings, current: object = None) -> FolderModels:
                 continue
             source = last
         sources[one] = source
-    models = FolderModels(before.standing, sources, refused)
+    models = FolderModels(before.standing, sources, refused, _load_donors(folder))
     if models.passed_over and len(models.passed_over) == len(sources):
         raise SettingsError(
             f"{folder}: {models.passed_over[0].full_name} is of the paper protocol, and there is no other "
@@ -133,15 +138,32 @@ def load_models(settings: Settings, current: object = None) -> FolderModels:
 
 def fingerprint(folder: Path | None) -> Fingerprint:
     """Return what changes when a checkpoint in a folder does."""
-    found = set()
+    found: set[tuple[str, int, int] | None] = set()
     for one in [] if folder is None or not folder.is_dir() else checkpoint_folders(folder):
-        for file in (one / CONFIG_FILE, one / TENSORS_FILE):
-            try:
-                stat = file.stat()
-            except OSError:
-                continue
-            found.add((str(file), stat.st_size, stat.st_mtime_ns))
-    return frozenset(found)
+        found |= {_stamp(file) for file in (one / CONFIG_FILE, one / TENSORS_FILE)}
+    if folder is not None:
+        found.add(_stamp(folder / DONORS_FILE))
+    return frozenset(stamp for stamp in found if stamp is not None)
+
+
+def _stamp(file: Path) -> tuple[str, int, int] | None:
+    """Return path, size and time of change of a file; None: it cannot be read."""
+    try:
+        stat = file.stat()
+    except OSError:
+        return None
+    return str(file), stat.st_size, stat.st_mtime_ns
+
+
+def _load_donors(folder: Path | None) -> Donors | None:
+    """Return the donors of a folder; None if it has none, or if their file is damaged, which is logged."""
+    if folder is None:
+        return None
+    try:
+        return load_donors(folder)
+    except DonorsError as error:
+        _log.warning("donors of explanations refused", reason=str(error))
+        return None
 
 
 def _read_configs(folder: Path | None, before: FolderModels) -> dict[Path, str]:

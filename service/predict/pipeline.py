@@ -121,7 +121,7 @@ class Pipeline:
             work()
 
     async def predict(
-        self, request: pb.PredictRequest | EncodedRequest, call: Call | None = None
+        self, request: pb.PredictRequest | EncodedRequest[pb.PredictRequest], call: Call | None = None
     ) -> pb.PredictResponse:
         """Forecast the agents of a scene. Cancellation removes the call from the queue.
 

@@ -99,6 +99,11 @@ class Plan:
     """Rows of the usable agents in the scene, by index in the request."""
     groups: list[Group] = field(default_factory=list)
 
+    @property
+    def ids(self) -> dict[int, str]:
+        """Ids of the agents of the scene, by row."""
+        return {row: self.agents.ids[index] for index, row in self.rows.items()}
+
     def add_groups(self, drafts: Iterable[Draft]) -> list[Group]:
         """Prepare the forwards of drafts, one per forecaster and agent type.
 

@@ -10,6 +10,7 @@ import ctypes
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import replace
 from typing import TypeVar
 
 import structlog
@@ -159,7 +160,9 @@ class Reloader:
         self._read_at = await self._in_thread(fingerprint, models_folder(self._settings))
         models = await self._in_thread(self._load, current)
         reasons = [f"{one.folder}: {one.reason}" for one in _refused(models)]
-        return build_catalog(models, self._settings.default_model, self._settings.default_models, reasons)
+        donors = models.donors if isinstance(models, FolderModels) else None
+        catalog = build_catalog(models, self._settings.default_model, self._settings.default_models, reasons)
+        return replace(catalog, donors=donors)
 
     def _set(self, catalog: Catalog) -> None:
         self._catalog = catalog

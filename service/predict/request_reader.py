@@ -10,10 +10,12 @@ import asyncio
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 from google.protobuf.message import DecodeError
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
+from cab.forecast.v1.explanation_service_pb2 import ExplainRequest
 from service.errors import BadField, Overloaded, TooLarge
 from service.settings import Settings
 
@@ -28,7 +30,12 @@ _MIN_STATES_LIMIT = 2**16
 """States that any request may hold, however low the limits are: one agent with too many states is then
 reported as invalid, and the other agents get their forecasts."""
 
+SceneRequest = TypeVar("SceneRequest", pb.PredictRequest, ExplainRequest)
+"""Requests about a scene, whose agents have the same field number."""
+
 _AGENTS = pb.PredictRequest.AGENTS_FIELD_NUMBER
+if ExplainRequest.AGENTS_FIELD_NUMBER != _AGENTS:
+    raise ImportError("requests number their agents differently: service.predict.request_reader counts them")
 _STATES = pb.Agent.STATES_FIELD_NUMBER
 _OTHER_FIELDS = 64
 """Max number of fields of a message besides agents or states; leaves room for fields of newer clients."""
@@ -76,11 +83,11 @@ class RequestLimits:
 
 
 @dataclass(frozen=True)
-class EncodedRequest:
+class EncodedRequest(Generic[SceneRequest]):
     """A request body with its parser."""
 
     body: bytes
-    parse: Callable[[bytes], pb.PredictRequest]
+    parse: Callable[[bytes], SceneRequest]
     """Parser of the body; raises a ``ServiceError`` if the body is malformed or too large."""
     inline_bytes: int = 0
     """Size up to which parsing takes less time than the handover to a thread."""
@@ -98,7 +105,7 @@ class RequestReader:
         self._turn = asyncio.Lock()
         self._waiting = 0
 
-    async def read(self, encoded: EncodedRequest) -> pb.PredictRequest:
+    async def read(self, encoded: EncodedRequest[SceneRequest]) -> SceneRequest:
         """Return the parsed request.
 
         Raises:
@@ -122,17 +129,22 @@ class RequestReader:
         # A thread cannot be stopped: the turn lasts until it ends, even if the caller is cancelled
         return await asyncio.shield(parsing)
 
-    def _parse_in_thread(self, encoded: EncodedRequest) -> "asyncio.Future[pb.PredictRequest]":
+    def _parse_in_thread(self, encoded: EncodedRequest[SceneRequest]) -> "asyncio.Future[SceneRequest]":
         return asyncio.get_running_loop().run_in_executor(self._threads, encoded.parse, encoded.body)
 
-    def _pass_turn(self, parsing: "asyncio.Future[pb.PredictRequest]") -> None:
+    def _pass_turn(self, parsing: "asyncio.Future[SceneRequest]") -> None:
         self._turn.release()
         if not parsing.cancelled():
             parsing.exception()  # retrieved, or asyncio would log that it never was
 
 
-def read_protobuf(body: bytes, limits: RequestLimits) -> pb.PredictRequest:
+def read_protobuf(kind: type[SceneRequest], body: bytes, limits: RequestLimits) -> SceneRequest:
     """Return the request that a protobuf body encodes.
+
+    Args:
+        kind: type of the request.
+        body: the body.
+        limits: the limits.
 
     Raises:
         TooLarge: the request holds more agents or states than the limits.
@@ -140,9 +152,9 @@ def read_protobuf(body: bytes, limits: RequestLimits) -> pb.PredictRequest:
     """
     _check_protobuf(body, limits)
     try:
-        return pb.PredictRequest.FromString(body)
+        return kind.FromString(body)
     except DecodeError as error:
-        raise BadField("body", f"is no {pb.PredictRequest.DESCRIPTOR.full_name}") from error
+        raise BadField("body", f"is no {kind.DESCRIPTOR.full_name}") from error
 
 
 def _check_protobuf(body: bytes, limits: RequestLimits) -> None:

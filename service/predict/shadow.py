@@ -38,8 +38,6 @@ _MAX_CALLS = 32
 _MAX_BYTES = 64 * 2**20
 _MAX_AGE = 1.0
 """Seconds that a call waits before it is dropped; the track memory accepts calls that are up to 2 s late."""
-_POLL = 0.002
-"""Seconds between looks at whether the model is free."""
 
 
 @dataclass(frozen=True)
@@ -226,11 +224,8 @@ class Shadow:
         Raises:
             _LateError: that took too long.
         """
-        loop = asyncio.get_running_loop()
-        while not self._batcher.is_free:
-            if loop.time() > work.until:
-                raise _LateError
-            await asyncio.sleep(_POLL)
+        if not await self._batcher.until_free(work.until):
+            raise _LateError
 
     def _count(self, forecaster: Forecaster, result: str) -> None:
         self._metrics.shadow_calls.labels(forecaster.info.full_name, result).inc()

@@ -49,7 +49,8 @@ UNARY_METHODS: Mapping[Route[Any, Any], Callable[[DataPlane, Any], Awaitable[Mes
     LIST_SCENES: lambda dataplane, request: dataplane.scenes.list_scenes(request),
     RELOAD_MODELS: lambda dataplane, request: dataplane.reload_models(request),
 }
-"""Functions that execute the unary methods except Predict, whose requests are decoded off the event loop."""
+"""Functions that execute the unary methods except Predict and Explain, whose requests are decoded off the
+event loop."""
 
 STREAMS: Mapping[Route[Any, Any], Callable[[DataPlane, Any], AsyncIterator[Event]]] = {
     WATCH_SCENE: lambda dataplane, request: dataplane.consistency.watch_scene(request),

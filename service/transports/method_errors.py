@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from cab.forecast.v1.routes import (
+    EXPLAIN,
     GET_AGENT_CONSISTENCY,
     GET_MODEL,
     GET_SCENE_CONSISTENCY,
@@ -48,16 +49,18 @@ ACCESS: Errors = (Unauthenticated, PermissionDenied, LimitExceeded)
 RETRYABLE: Errors = (LimitExceeded, Overloaded, Unavailable, TrackingUnavailable)
 """Errors that tell when to try again."""
 _ALL_METHODS: Errors = (*ACCESS, NotAcceptable, Overloaded, Unavailable, Internal)
+_OF_A_SCENE: Errors = (
+    BadFields,
+    UnknownModel,
+    UnknownRaster,
+    TooLarge,
+    UnsupportedMediaType,
+    RequestTimeout,
+    DeadlineExceeded,
+)
 _ERRORS: Mapping[Route[Any, Any], Errors] = {
-    PREDICT: (
-        BadFields,
-        UnknownModel,
-        UnknownRaster,
-        TooLarge,
-        UnsupportedMediaType,
-        RequestTimeout,
-        DeadlineExceeded,
-    ),
+    PREDICT: _OF_A_SCENE,
+    EXPLAIN: _OF_A_SCENE,
     LIST_MODELS: (),
     GET_MODEL: (UnknownModel, NotFound, MethodNotAllowed),
     GET_VERSION: (),

@@ -11,6 +11,7 @@ import grpc
 import torch
 from grpc import aio
 
+from cab.forecast.v1 import prediction_service_pb2 as pb
 from cab.forecast.v1.routes import PREDICT
 from loadtest.peers.network import HOST, ServedModel
 from model.forecaster import complete
@@ -42,7 +43,7 @@ class Predict:
 
     def __call__(self, body: bytes) -> bytes:
         """Return the body of the response."""
-        request = read_protobuf(body, self._limits)
+        request = read_protobuf(pb.PredictRequest, body, self._limits)
         forecaster = self._catalog.get(request.model)
         options = read_options(request, forecaster.info, self._settings)
         plan = make_plan(request, options, forecaster, self._catalog, self._settings)

@@ -1,8 +1,8 @@
 """gRPC handlers of the contract's methods.
 
 The handlers read and return bytes. A request that is too large or malformed therefore fails like any other
-bad request, with error details, and not without details inside gRPC. Predict reads its request after the call
-has been accepted.
+bad request, with error details, and not without details inside gRPC. Predict and Explain read their requests
+after the call has been accepted.
 
 gRPC cancels a handler when the client disconnects or its deadline passes, which removes the call from any
 queue that it waits in.
@@ -18,7 +18,9 @@ import grpc
 from google.protobuf.message import Message
 from grpc import aio
 
-from cab.forecast.v1.routes import PREDICT, SERVICES, Request, Response, Route
+from cab.forecast.v1.explanation_service_pb2 import ExplainRequest
+from cab.forecast.v1.prediction_service_pb2 import PredictRequest
+from cab.forecast.v1.routes import EXPLAIN, PREDICT, SERVICES, Request, Response, Route
 from service.access.caller import Grant
 from service.errors import TooLarge
 from service.predict.dataplane import DataPlane
@@ -41,12 +43,13 @@ class Handlers:
         self._dataplane = dataplane
         self._records = records
         self._max_bytes = settings.max_request_bytes
-        self._read_request = functools.partial(read_protobuf, limits=RequestLimits.from_settings(settings))
+        self._limits = RequestLimits.from_settings(settings)
 
     def generic(self) -> "list[grpc.GenericRpcHandler[bytes, bytes]]":
         """Return handlers for ``server.add_generic_rpc_handlers``, one per service."""
         handlers: dict[Route[Any, Any], grpc.RpcMethodHandler[bytes, bytes]] = {
             PREDICT: self._bytes(PREDICT, self._predict),
+            EXPLAIN: self._bytes(EXPLAIN, self._explain),
         }
         for route, watch in STREAMS.items():
             handlers[route] = self._stream(route, functools.partial(watch, self._dataplane))
@@ -63,8 +66,15 @@ class Handlers:
     async def _predict(self, incoming: Incoming, grant: Grant, context: Context) -> Message:
         # The call counts as in progress until the response was sent, not only until this returns.
         call = incoming.hold(self._dataplane.accept(context.time_remaining(), grant))
-        body = await self._read(incoming)
-        return await self._dataplane.predict(EncodedRequest(body, self._read_request, LARGE_BYTES), call)
+        read = functools.partial(read_protobuf, PredictRequest, limits=self._limits)
+        encoded = EncodedRequest(await self._read(incoming), read, LARGE_BYTES)
+        return await self._dataplane.predict(encoded, call)
+
+    async def _explain(self, incoming: Incoming, grant: Grant, context: Context) -> Message:
+        call = incoming.hold(self._dataplane.accept_explanation(context.time_remaining(), grant))
+        read = functools.partial(read_protobuf, ExplainRequest, limits=self._limits)
+        encoded = EncodedRequest(await self._read(incoming), read, LARGE_BYTES)
+        return await self._dataplane.explain(encoded, call)
 
     def _bytes(
         self, route: Route[Any, Any], behavior: Callable[[Incoming, Grant, Context], Awaitable[Message]]

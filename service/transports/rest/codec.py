@@ -28,7 +28,7 @@ from cab.forecast.v1 import prediction_service_pb2 as pb
 from cab.forecast.v1.model_service_pb2 import AgentType
 from service.errors import BadField, TooLarge
 from service.predict.request import UNKNOWN_TYPE_NAME
-from service.predict.request_reader import RequestLimits
+from service.predict.request_reader import RequestLimits, SceneRequest
 
 _M = TypeVar("_M", bound=Message)
 _Encoder = Callable[[Any], Any]
@@ -125,8 +125,13 @@ def read_query(
     return from_document(message_type, document)
 
 
-def read_request(body: bytes, limits: RequestLimits) -> pb.PredictRequest:
-    """Parse a Predict request from JSON.
+def read_request(kind: type[SceneRequest], body: bytes, limits: RequestLimits) -> SceneRequest:
+    """Parse a request about a scene from JSON.
+
+    Args:
+        kind: type of the request.
+        body: the body.
+        limits: the limits.
 
     Raises:
         TooLarge: the request has more agents or states than allowed.
@@ -137,7 +142,7 @@ def read_request(body: bytes, limits: RequestLimits) -> pb.PredictRequest:
     _check_document(document, limits)
     _mark_unknown_types(document)
     states = _pop_plain_states(document)
-    request = from_document(pb.PredictRequest, document)
+    request = from_document(kind, document)
     for index, plain in states.items():
         request.agents[index].states.extend(plain)
     return request

@@ -3,7 +3,7 @@
 import asyncio
 import functools
 from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import ExitStack, aclosing
+from contextlib import AbstractContextManager, ExitStack, aclosing
 from typing import Any, TypeVar
 
 import orjson
@@ -12,13 +12,22 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from cab.forecast.v1.routes import MODEL_SERVICE, PREDICT, Route
+from cab.forecast.v1.explanation_service_pb2 import ExplainRequest
+from cab.forecast.v1.prediction_service_pb2 import PredictRequest
+from cab.forecast.v1.routes import EXPLAIN, MODEL_SERVICE, PREDICT, Route
 from service.access.caller import Grant
 from service.access.gate import Gate
 from service.access.scopes import scope_of
 from service.errors import RequestTimeout, TooLarge
+from service.predict.admission import Call
 from service.predict.dataplane import DataPlane
-from service.predict.request_reader import LARGE_BYTES, EncodedRequest, RequestLimits, read_protobuf
+from service.predict.request_reader import (
+    LARGE_BYTES,
+    EncodedRequest,
+    RequestLimits,
+    SceneRequest,
+    read_protobuf,
+)
 from service.settings import Settings
 from service.transports.calls import STREAMS, UNARY_METHODS, CallRecorder, CallRecords, parse_message
 from service.transports.intake import Intake
@@ -65,6 +74,7 @@ class Endpoints:
         """Return the endpoint of each route."""
         endpoints: dict[Route[Any, Any], Endpoint] = {
             PREDICT: self._recorded(PREDICT, self._predict),
+            EXPLAIN: self._recorded(EXPLAIN, self._explain),
         }
         for route in STREAMS:
             endpoints[route] = functools.partial(self._watch, route)
@@ -95,18 +105,42 @@ class Endpoints:
         return endpoint
 
     async def _predict(self, request: Request, grant: Grant) -> Response:
+        plane = self._dataplane
+        return await self._scene(PredictRequest, request, grant, plane.accept, plane.predict)
+
+    async def _explain(self, request: Request, grant: Grant) -> Response:
+        plane = self._dataplane
+        return await self._scene(ExplainRequest, request, grant, plane.accept_explanation, plane.explain)
+
+    async def _scene(
+        self,
+        kind: type[SceneRequest],
+        request: Request,
+        grant: Grant,
+        accept: Callable[[float | None, Grant | None], AbstractContextManager[Call]],
+        execute: Callable[[EncodedRequest[SceneRequest], Call], Awaitable[Message]],
+    ) -> Response:
+        """Execute a method whose request is a scene.
+
+        Args:
+            kind: type of the request.
+            request: the HTTP request.
+            grant: counts the agents of the request.
+            accept: accepts the call.
+            execute: executes it.
+        """
         incoming = request_format(request.headers)
         outgoing = response_format(request.headers, preferred=incoming)
         # The call counts as in progress until the response was sent, not only until this returns.
-        call = exit_stack(request).enter_context(self._dataplane.accept(timeout(request.headers), grant))
+        call = exit_stack(request).enter_context(accept(timeout(request.headers), grant))
         async with call.in_time():
             body = await self._read_body(request, self._max_bytes)
         if incoming is Format.JSON:  # always slow enough to be parsed in a thread
-            encoded = EncodedRequest(body, functools.partial(read_request, limits=self._limits))
+            encoded = EncodedRequest(body, functools.partial(read_request, kind, limits=self._limits))
         else:
-            read = functools.partial(read_protobuf, limits=self._limits)
+            read = functools.partial(read_protobuf, kind, limits=self._limits)
             encoded = EncodedRequest(body, read, LARGE_BYTES)
-        message = await cancel_on_disconnect(request.receive, self._dataplane.predict(encoded, call))
+        message = await cancel_on_disconnect(request.receive, execute(encoded, call))
         if outgoing is Format.PROTOBUF:  # takes less time than the handover to a thread
             return _message_response(message, outgoing)
         return await asyncio.to_thread(_message_response, message, outgoing)

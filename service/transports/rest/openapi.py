@@ -12,6 +12,7 @@ from cab.forecast.v1 import prediction_service_pb2 as predict_pb
 from cab.forecast.v1 import scene_service_pb2 as scenes_pb
 from cab.forecast.v1.bounds import STEP_SECONDS
 from cab.forecast.v1.routes import (
+    EXPLAIN,
     GET_MODEL,
     PREDICT,
     RELOAD_MODELS,
@@ -112,7 +113,7 @@ def _operation(route: Route[Any, Any], settings: Settings) -> Schema:
 
 def _parameters(route: Route[Any, Any], settings: Settings) -> list[Schema]:
     """Return the parameters of a method in path, query and headers."""
-    if route is PREDICT:
+    if route in (PREDICT, EXPLAIN):
         return [
             _timeout_parameter(
                 "Seconds that the client waits for the response; work not begun by then is dropped."
@@ -267,6 +268,18 @@ def predict_examples() -> dict[str, dict[str, Any]]:
     }
 
 
+def explain_examples() -> dict[str, dict[str, Any]]:
+    """Return example requests of Explain by name; each works as it stands."""
+    car = _agent(EXAMPLE_IDS["agent_id"], "AGENT_TYPE_VEHICLE", x=100.0, y=50.0, speed=8.0)
+    ahead = _agent("car-2", "AGENT_TYPE_VEHICLE", x=120.0, y=50.0, speed=4.0) | {"predict": False}
+    return {
+        "following": {
+            "summary": "A car behind a slower one: what the forecast owes to it",
+            "value": {"time": _NOW, "agents": [car, ahead], "options": {"by_neighbor": True}},
+        }
+    }
+
+
 def reset_examples() -> dict[str, dict[str, Any]]:
     """Return example requests of ResetScene by name."""
     return {"street": {"summary": "Forget a scene", "value": {"scene_id": EXAMPLE_IDS["scene_id"]}}}
@@ -279,6 +292,7 @@ def reload_examples() -> dict[str, dict[str, Any]]:
 
 _EXAMPLES: dict[Route[Any, Any], Callable[[], dict[str, dict[str, Any]]]] = {
     PREDICT: predict_examples,
+    EXPLAIN: explain_examples,
     RESET_SCENE: reset_examples,
     RELOAD_MODELS: reload_examples,
 }

@@ -9,7 +9,13 @@ from typing import Any
 
 from google.protobuf.descriptor import Descriptor, EnumDescriptor, FieldDescriptor
 
-from cab.forecast.v1.bounds import FIELD_BOUNDS, MAX_ID_LENGTH, STEP_SECONDS
+from cab.forecast.v1.bounds import (
+    FIELD_BOUNDS,
+    MAX_DRAWS,
+    MAX_ID_LENGTH,
+    MAX_PERMUTATIONS,
+    STEP_SECONDS,
+)
 from cab.forecast.v1.digest import DIGEST_BYTES
 from cab.forecast.v1.routes import ROUTES
 from service.settings import Settings
@@ -30,6 +36,7 @@ _SCALARS: dict[int, Schema] = {
 }
 REQUIRED = {
     "PredictRequest": ["time"],
+    "ExplainRequest": ["time"],
     "Agent": ["id", "type", "states"],
     "AgentState": ["time", "x", "y"],
     "MapPatch": ["image"],
@@ -108,6 +115,10 @@ def bounds(settings: Settings) -> dict[str, Schema]:
     return numbers | {
         "PredictRequest.scene_id": {"maxLength": MAX_ID_LENGTH},
         "PredictRequest.agents": {"maxItems": settings.max_agents},
+        "ExplainRequest.agents": {"maxItems": settings.max_agents},
+        "ExplainOptions.draws": {"maximum": MAX_DRAWS},
+        "ExplainOptions.permutations": {"maximum": MAX_PERMUTATIONS, "multipleOf": 2},
+        "ExplainOptions.horizon": {"minimum": STEP_SECONDS, "multipleOf": STEP_SECONDS},
         "Agent.id": an_id,
         "Agent.states": {"minItems": 1, "maxItems": settings.max_states},
         "SceneRaster.rows": {"maximum": settings.max_raster_pixels},

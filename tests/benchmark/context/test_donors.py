@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from benchmark.context.cases import SHIFT_M, TURN, Cases, Change
-from benchmark.context.donors import LENGTH_M, LIKE_SPEED, NEIGHBORS_M, WIDTH_M, DonorPool
+from benchmark.context.donors import DonorPool
 from benchmark.context.moves import Move
 from benchmark.plan import PlannedScene, plan_scenes
+from model.explanation.matching import LENGTH_M, LIKE_SPEED, NEIGHBORS_M, WIDTH_M
 from model.geometry import rotate
 from model.metrics.offroad import driveable
 from tests.model.data.records import FixedReader, record

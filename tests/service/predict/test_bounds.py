@@ -1,6 +1,7 @@
 """The contract's bounds: they name its fields, and the model's sizes are the same."""
 
 from cab.forecast.v1 import bounds
+from cab.forecast.v1 import explanation_service_pb2 as explanation_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.scenes import raster, scene
 
@@ -8,7 +9,12 @@ from model.scenes import raster, scene
 def test_bounds_name_real_fields() -> None:
     for path, (low, high) in bounds.FIELD_BOUNDS.items():
         message, _, field = path.partition(".")
-        assert field in pb.DESCRIPTOR.message_types_by_name[message].fields_by_name
+        [found] = [
+            file.message_types_by_name[message]
+            for file in (pb.DESCRIPTOR, explanation_pb.DESCRIPTOR)
+            if message in file.message_types_by_name
+        ]
+        assert field in found.fields_by_name
         assert low < high
 
 

@@ -495,7 +495,7 @@ async def test_warm_up_meets_every_shape_of_the_default_model() -> None:
     assert [agents for _, agents, _, _ in other.batches] == [1] * 2
 
 
-def slow(seconds: float) -> EncodedRequest:
+def slow(seconds: float) -> EncodedRequest[pb.PredictRequest]:
     """A request that takes so long to read."""
 
     def read(_: bytes) -> pb.PredictRequest:

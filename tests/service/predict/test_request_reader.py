@@ -147,16 +147,16 @@ def test_requests_are_read() -> None:
     request = make_request(20, samples=3)
     request.agents[0].map_patch.image.packed_bits = bytes(3750)
     request.scene_raster.image.png = b"\x22\x00" * 3000  # looks like agents, and is none
-    assert read_protobuf(request.SerializeToString(), DEFAULT) == request
-    assert read_protobuf(b"", DEFAULT) == pb.PredictRequest()
+    assert read_protobuf(pb.PredictRequest, request.SerializeToString(), DEFAULT) == request
+    assert read_protobuf(pb.PredictRequest, b"", DEFAULT) == pb.PredictRequest()
 
 
 def test_as_many_as_may_be() -> None:
-    assert len(read_protobuf(EMPTY_AGENT * 3, LIMITS).agents) == 3
+    assert len(read_protobuf(pb.PredictRequest, EMPTY_AGENT * 3, LIMITS).agents) == 3
     agent = field(AGENT, EMPTY_STATE * 5)
-    assert len(read_protobuf(agent, LIMITS).agents[0].states) == 5
+    assert len(read_protobuf(pb.PredictRequest, agent, LIMITS).agents[0].states) == 5
     halves = field(AGENT, EMPTY_STATE * 2) + field(AGENT, EMPTY_STATE * 3)
-    assert len(read_protobuf(halves, LIMITS).agents) == 2
+    assert len(read_protobuf(pb.PredictRequest, halves, LIMITS).agents) == 2
 
 
 @pytest.mark.parametrize(
@@ -177,7 +177,7 @@ def test_as_many_as_may_be() -> None:
 def test_too_large(body: bytes, message: str) -> None:
     pb.PredictRequest.FromString(body)
     with pytest.raises(TooLarge, match=message):
-        read_protobuf(body, LIMITS)
+        read_protobuf(pb.PredictRequest, body, LIMITS)
 
 
 @pytest.mark.parametrize(
@@ -194,7 +194,7 @@ def test_too_large(body: bytes, message: str) -> None:
 def test_what_is_too_large_costs_nothing(body: bytes) -> None:
     def read() -> None:
         with pytest.raises(TooLarge):
-            read_protobuf(body, DEFAULT)
+            read_protobuf(pb.PredictRequest, body, DEFAULT)
 
     assert cpu_seconds(read) < 0.5  # some 0.1 s for a quarter of a million states, else nothing
 
@@ -203,7 +203,9 @@ def test_too_many_states_of_one_agent_cost_that_agent_only() -> None:
     request = make_request(1)
     add_agent(request, "long", frames=600)
     read = read_protobuf(
-        request.SerializeToString(), RequestLimits.from_settings(Settings(max_agents=2, max_states=512))
+        pb.PredictRequest,
+        request.SerializeToString(),
+        RequestLimits.from_settings(Settings(max_agents=2, max_states=512)),
     )
     agents = read_agents(read, Settings())
     assert {index: fault.detail for index, fault in agents.faults.items()} == {1: "has 600; at most 512"}
@@ -212,7 +214,7 @@ def test_too_many_states_of_one_agent_cost_that_agent_only() -> None:
 def test_fields_of_a_newer_client_are_let_through() -> None:
     newer = b"\xfa\x07\x03abc\xf1\x07" + bytes(8) + b"\xf5\x07" + bytes(4) + b"\xf8\x07\x96\x01"
     body = newer + field(AGENT, EMPTY_STATE + newer) + newer
-    assert len(read_protobuf(body, LIMITS).agents[0].states) == 1
+    assert len(read_protobuf(pb.PredictRequest, body, LIMITS).agents[0].states) == 1
 
 
 @pytest.mark.parametrize(
@@ -220,7 +222,7 @@ def test_fields_of_a_newer_client_are_let_through() -> None:
 )
 def test_no_request(body: bytes) -> None:
     with pytest.raises(BadField) as caught:
-        read_protobuf(body, LIMITS)
+        read_protobuf(pb.PredictRequest, body, LIMITS)
     assert caught.value.faults[0].field == "body"
 
 
@@ -250,18 +252,18 @@ def test_nothing_too_large_gets_through(body: bytes) -> None:
         expected = pb.PredictRequest.FromString(body)
     except DecodeError:
         with pytest.raises((BadField, TooLarge)):
-            read_protobuf(body, LIMITS)
+            read_protobuf(pb.PredictRequest, body, LIMITS)
         return
     states = sum(len(agent.states) for agent in expected.agents)
     if len(expected.agents) > LIMITS.agents or states > LIMITS.states:
         with pytest.raises(TooLarge):
-            read_protobuf(body, LIMITS)
+            read_protobuf(pb.PredictRequest, body, LIMITS)
     else:
         with suppress(TooLarge):  # groups count as more than they are
-            assert read_protobuf(body, LIMITS) == expected
+            assert read_protobuf(pb.PredictRequest, body, LIMITS) == expected
 
 
 @given(st.binary(max_size=60))
 def test_any_bytes_are_a_request_or_refused(body: bytes) -> None:
     with suppress(ServiceError):
-        read_protobuf(body, DEFAULT)
+        read_protobuf(pb.PredictRequest, body, DEFAULT)

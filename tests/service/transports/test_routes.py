@@ -4,10 +4,12 @@ import pytest
 
 from cab.forecast.v1 import admin_service_pb2 as admin_pb
 from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
+from cab.forecast.v1 import explanation_service_pb2 as explanation_pb
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from cab.forecast.v1 import scene_service_pb2 as scenes_pb
 from cab.forecast.v1.routes import (
+    EXPLAIN,
     GET_AGENT_CONSISTENCY,
     GET_MODEL,
     LIST_MODEL_CONSISTENCY,
@@ -24,6 +26,7 @@ from tests.service.servers import settings
 
 FILES = (
     pb.DESCRIPTOR,
+    explanation_pb.DESCRIPTOR,
     models_pb.DESCRIPTOR,
     consistency_pb.DESCRIPTOR,
     scenes_pb.DESCRIPTOR,
@@ -70,7 +73,7 @@ async def test_server_and_document_have_the_routes() -> None:
     documented = {(verb, path) for path, verbs in paths.items() for verb in verbs if path.startswith("/v1/")}
     assert documented == {(route.verb.lower(), route.path) for route in ROUTES}
     unary = {route for route in ROUTES if not route.streaming}
-    assert set(UNARY_METHODS) == unary - {PREDICT}
+    assert set(UNARY_METHODS) == unary - {PREDICT, EXPLAIN}
 
 
 @pytest.mark.parametrize(

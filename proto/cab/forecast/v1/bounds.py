@@ -8,6 +8,10 @@ MAX_ID_LENGTH = 128
 """Characters of an agent's or a scene's id."""
 MAX_PRIORITY = 7
 """Highest priority of a call."""
+MAX_DRAWS = 32
+"""Most donors that an explanation draws for an agent."""
+MAX_PERMUTATIONS = 256
+"""Most orders of neighbours that an explanation draws for an agent."""
 STEP_SECONDS = 0.5
 """Seconds between the steps of a forecast."""
 PATCH_PIXELS = 100
@@ -18,6 +22,7 @@ _MAX_POSITION = 1e7
 
 FIELD_BOUNDS: dict[str, tuple[float, float]] = {
     "PredictRequest.time": (-_MAX_TIME, _MAX_TIME),
+    "ExplainRequest.time": (-_MAX_TIME, _MAX_TIME),
     "AgentState.time": (-_MAX_TIME, _MAX_TIME),
     "AgentState.x": (-_MAX_POSITION, _MAX_POSITION),
     "AgentState.y": (-_MAX_POSITION, _MAX_POSITION),

@@ -24,6 +24,7 @@ from cab.forecast.v1.consistency_service_pb2 import (
     WatchSceneRequest,
     WatchSceneResponse,
 )
+from cab.forecast.v1.explanation_service_pb2 import ExplainRequest, ExplainResponse
 from cab.forecast.v1.model_service_pb2 import (
     GetModelRequest,
     GetModelResponse,
@@ -44,11 +45,19 @@ Request = TypeVar("Request", bound=Message)
 Response = TypeVar("Response", bound=Message)
 
 PREDICTION_SERVICE = "cab.forecast.v1.PredictionService"
+EXPLANATION_SERVICE = "cab.forecast.v1.ExplanationService"
 MODEL_SERVICE = "cab.forecast.v1.ModelService"
 CONSISTENCY_SERVICE = "cab.forecast.v1.ConsistencyService"
 SCENE_SERVICE = "cab.forecast.v1.SceneService"
 ADMIN_SERVICE = "cab.forecast.v1.AdminService"
-SERVICES = (PREDICTION_SERVICE, MODEL_SERVICE, CONSISTENCY_SERVICE, SCENE_SERVICE, ADMIN_SERVICE)
+SERVICES = (
+    PREDICTION_SERVICE,
+    EXPLANATION_SERVICE,
+    MODEL_SERVICE,
+    CONSISTENCY_SERVICE,
+    SCENE_SERVICE,
+    ADMIN_SERVICE,
+)
 """Full names of all gRPC services of the contract."""
 
 _PATH_PARAMETER = re.compile(r"\{(\w+)\}")
@@ -91,6 +100,9 @@ class Route(Generic[Request, Response]):
 
 PREDICT: Route[PredictRequest, PredictResponse] = Route(
     PREDICTION_SERVICE, "Predict", "POST", "/v1/predict", PredictRequest, PredictResponse
+)
+EXPLAIN: Route[ExplainRequest, ExplainResponse] = Route(
+    EXPLANATION_SERVICE, "Explain", "POST", "/v1/explain", ExplainRequest, ExplainResponse
 )
 LIST_MODELS: Route[ListModelsRequest, ListModelsResponse] = Route(
     MODEL_SERVICE, "ListModels", "GET", "/v1/models", ListModelsRequest, ListModelsResponse
@@ -165,6 +177,7 @@ RELOAD_MODELS: Route[ReloadModelsRequest, ReloadModelsResponse] = Route(
 
 ROUTES: tuple[Route[Any, Any], ...] = (
     PREDICT,
+    EXPLAIN,
     LIST_MODELS,
     GET_MODEL,
     GET_VERSION,

@@ -34,13 +34,13 @@ def test_requests_are_read(snake: bool) -> None:
     request.agents[0].states[0].velocity_x = request.agents[0].states[0].velocity_y = 1.5
     request.agents[1].states[2].x = float("nan")  # a text in JSON: these states are for ParseDict
     text = json_format.MessageToJson(request, preserving_proto_field_name=snake)
-    read = read_request(text.encode(), DEFAULT)
+    read = read_request(pb.PredictRequest, text.encode(), DEFAULT)
     assert str(read) == str(request)  # not the messages: NaN is not equal to itself
 
 
 def test_as_many_as_may_be() -> None:
-    assert len(read_request(document([{}] * 3), LIMITS).agents) == 3
-    [agent] = read_request(document([{"states": [{}] * 5}]), LIMITS).agents
+    assert len(read_request(pb.PredictRequest, document([{}] * 3), LIMITS).agents) == 3
+    [agent] = read_request(pb.PredictRequest, document([{"states": [{}] * 5}]), LIMITS).agents
     assert len(agent.states) == 5
 
 
@@ -59,7 +59,7 @@ def test_as_many_as_may_be() -> None:
 )
 def test_too_large(agents: list[Any], message: str) -> None:
     with pytest.raises(TooLarge, match=message):
-        read_request(document(agents), LIMITS)
+        read_request(pb.PredictRequest, document(agents), LIMITS)
 
 
 @pytest.mark.parametrize(
@@ -76,7 +76,7 @@ def test_too_large(agents: list[Any], message: str) -> None:
 def test_what_is_too_large_costs_nothing(body: bytes) -> None:
     def read() -> None:
         with pytest.raises(TooLarge):
-            read_request(body, DEFAULT)
+            read_request(pb.PredictRequest, body, DEFAULT)
 
     assert cpu_seconds(read) < 0.5  # some 0.02 s, the time to count brackets
 
@@ -86,14 +86,16 @@ def test_the_largest_request_takes_a_second_not_a_minute() -> None:
     for index in range(128):
         add_agent(request, f"a{index}", frames=256)
     text = json_format.MessageToJson(request, indent=None).encode()
-    assert read_request(text, DEFAULT) == request
-    seconds = cpu_seconds(lambda: read_request(text, DEFAULT))
+    assert read_request(pb.PredictRequest, text, DEFAULT) == request
+    seconds = cpu_seconds(lambda: read_request(pb.PredictRequest, text, DEFAULT))
     assert seconds < 0.6  # some 0.05 s; ParseDict takes ten times as long
 
 
 def test_too_many_states_of_one_agent_are_read() -> None:
     limits = RequestLimits.from_settings(Settings(max_agents=2, max_states=5))
-    assert len(read_request(document([{"states": [{}] * 6}]), limits).agents[0].states) == 6
+    assert (
+        len(read_request(pb.PredictRequest, document([{"states": [{}] * 6}]), limits).agents[0].states) == 6
+    )
 
 
 @pytest.mark.parametrize(
@@ -113,7 +115,7 @@ def test_too_many_states_of_one_agent_are_read() -> None:
 )
 def test_what_is_no_request_is_a_bad_field(body: bytes, field: str) -> None:
     with pytest.raises(BadField) as caught:
-        read_request(body, DEFAULT)
+        read_request(pb.PredictRequest, body, DEFAULT)
     [fault] = caught.value.faults
     assert fault.field == field or fault.field.startswith(field + ".")
 
@@ -139,10 +141,10 @@ def outcome(read: Callable[[bytes], pb.PredictRequest], body: bytes) -> object:
 def test_plain_states_are_read_as_protobuf_reads_them(given_agents: list[dict[str, Any]]) -> None:
     body = document(given_agents)
     expected = outcome(functools.partial(parse_json, pb.PredictRequest), body)
-    assert outcome(functools.partial(read_request, limits=DEFAULT), body) == expected
+    assert outcome(functools.partial(read_request, pb.PredictRequest, limits=DEFAULT), body) == expected
 
 
 @given(st.binary(max_size=60))
 def test_any_bytes_are_a_request_or_refused(body: bytes) -> None:
     with suppress(BadField, TooLarge):
-        read_request(body, LIMITS)
+        read_request(pb.PredictRequest, body, LIMITS)

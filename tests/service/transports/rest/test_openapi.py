@@ -8,6 +8,7 @@ from google.protobuf import json_format
 
 from cab.forecast.v1 import admin_service_pb2 as admin_pb
 from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
+from cab.forecast.v1 import explanation_service_pb2 as explanation_pb
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from cab.forecast.v1 import scene_service_pb2 as scenes_pb
@@ -21,6 +22,7 @@ from tests.service.servers import running
 
 FILES = (
     pb.DESCRIPTOR,
+    explanation_pb.DESCRIPTOR,
     models_pb.DESCRIPTOR,
     consistency_pb.DESCRIPTOR,
     scenes_pb.DESCRIPTOR,

@@ -1,0 +1,1 @@
+"""Explanations of forecasts by Shapley values: own state, map and neighbours, and each neighbour."""
