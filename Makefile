@@ -30,8 +30,8 @@ run: install  ## serve on 127.0.0.1:8080 (REST) and 127.0.0.1:50051 (gRPC), and 
 test: install lint proto-check  ## lint, check types and generated code, run all tests
 	$(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist loadfile
 
-test-system: install  ## replicas behind HAProxy, scraped by Prometheus (apt-get install haproxy prometheus); needs redis-server
-	$(BIN)/python -m pytest -m system tests/system
+test-system: install  ## replicas behind HAProxy, the console (apt-get install haproxy prometheus chromium npm); needs redis-server
+	$(BIN)/python -m pytest -m system tests/system tests/service/console
 
 # nuscenes-devkit needs numpy < 2, so it has its own environment, with all other pins of constraints.txt.
 $(NUSCENES)/.installed: pyproject.toml constraints.txt

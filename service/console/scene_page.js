@@ -39,8 +39,8 @@ export class ScenePage {
     this._scheduled = false;
     this._following = false;
     this._mayPredict = true;
-    /** Counts for those who measure: ticks that came, and ticks that were drawn. */
-    this.counts = { received: 0, drawn: 0, dropped: 0 };
+    /** For those who measure: ticks that came, were drawn and were lost, ms of drawing, times that are shown. */
+    this.counts = { received: 0, drawn: 0, dropped: 0, milliseconds: 0, time: null, secondTime: null };
     this._reset();
     this._listen();
   }
@@ -269,7 +269,10 @@ export class ScenePage {
     this._scheduled = true;
     requestAnimationFrame(() => {
       this._scheduled = false;
-      if (this._watch) this._draw();
+      if (!this._watch) return;
+      const begin = performance.now();
+      this._draw();
+      this.counts.milliseconds += performance.now() - begin;
     });
   }
 
@@ -300,6 +303,8 @@ export class ScenePage {
     this._showAgent(chosen, frame, other);
     if (frame && frame !== this._drawn) this.counts.drawn += 1;
     this._drawn = frame;
+    this.counts.time = frame?.time ?? null;
+    this.counts.secondTime = other?.time ?? null;
     this._sayQuiet();
   }
 

@@ -51,7 +51,9 @@ class Console:
 
     def wait_for_ticks(self, more: int = 5) -> None:
         """Wait until more ticks were drawn."""
-        self.page.wait_for_function("least => cabForecastConsole.counts.drawn >= least", arg=self.drawn() + more)
+        self.page.wait_for_function(
+            "least => cabForecastConsole.counts.drawn >= least", arg=self.drawn() + more
+        )
 
     def text(self, selector: str) -> str:
         """Return the text of an element."""

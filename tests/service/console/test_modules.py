@@ -106,7 +106,9 @@ def test_a_frame_is_sent_back_as_a_request_that_is_not_remembered(page: Page) ->
     silent = agent | {"id": "b", "predicted": False, "status": "FORECAST_STATUS_UNSPECIFIED", "weights": []}
     wrong = agent | {"id": "c", "status": "FORECAST_STATUS_INVALID", "weights": [], "means": []}
     frame = {"time": 10.0, "map_digest": "AAAA", "agents": [agent | {"id": "a"}, silent, wrong]}
-    request = call(page, "frames", "return m.predictRequest(m.decodeFrame(a), { model: 'cab', samples: 3 });", frame)
+    request = call(
+        page, "frames", "return m.predictRequest(m.decodeFrame(a), { model: 'cab', samples: 3 });", frame
+    )
     assert request["scene_raster"] == {"digest": "AAAA"}
     assert request["options"] == {"merge": True, "max_modes": 5, "samples": 3}
     assert [(each["id"], each["predict"]) for each in request["agents"]] == [("a", True), ("b", False)]
@@ -116,7 +118,9 @@ def test_a_frame_is_sent_back_as_a_request_that_is_not_remembered(page: Page) ->
 
 def test_a_map_is_recoloured(page: Page) -> None:
     image = Image.new("P", (4, 2))
-    image.putpalette([0, 0, 0, 255, 0, 0, 0, 255, 0, 255, 255, 0, 0, 0, 255, 255, 0, 255, 0, 255, 255, 9, 9, 9])
+    image.putpalette(
+        [0, 0, 0, 255, 0, 0, 0, 255, 0, 255, 255, 0, 0, 0, 255, 255, 0, 255, 0, 255, 255, 9, 9, 9]
+    )
     image.putdata(list(range(8)))
     buffer = io.BytesIO()
     image.save(buffer, "PNG")
@@ -141,7 +145,8 @@ LATER = METRICS.replace("10.0\n", "30.0\n").replace("8.0", "16.0").replace("1.5"
 
 
 def test_metrics_are_parsed(page: Page) -> None:
-    body = "return [m.parseMetrics(a).get('calls_total'), m.total(m.parseMetrics(a), 'calls_total', { code: 'OK' })];"
+    body = """const found = m.parseMetrics(a);
+        return [found.get("calls_total"), m.total(found, "calls_total", { code: "OK" })];"""
     samples, total = call(page, "prometheus", body, METRICS)
     assert samples[0] == {"labels": {"code": "OK", "path": 'a"b'}, "value": 10.0}
     assert total == 10.0
@@ -185,8 +190,8 @@ def test_zooming_keeps_the_point_under_the_pointer(page: Page) -> None:
         const size = { width: 800, height: 600 };
         const before = view.toGround(100, 50, size);
         view.zoom(2, 100, 50, size);
-        view.pan(0, 0);
-        return [before, view.toGround(100, 50, size), view.scale, view.toCanvas(...view.toGround(3, 4, size), size)];"""
+        const there = view.toCanvas(...view.toGround(3, 4, size), size);
+        return [before, view.toGround(100, 50, size), view.scale, there];"""
     before, after, scale, there = call(page, "view", body)
     assert after == pytest.approx(before)
     assert scale == 10

@@ -30,7 +30,7 @@ def rings_raster() -> SceneRaster:
 def ring_agent(number: int, now: float) -> Agent:
     """Return an agent that drives along a ring, with 2 s of history at 2 Hz.
 
-    Every seventh has one observation only, every ninth is there for the others, and every fourth is a pedestrian.
+    Every seventh has one observation only, every ninth is context only, and every fourth is a pedestrian.
     """
     radius = 18.0 + 12.0 * (number % 5) + (1.75 if number % 2 else -1.75)
     kind = "pedestrian" if number % 4 == 3 else "vehicle"
@@ -49,7 +49,9 @@ def ring_agent(number: int, now: float) -> Agent:
     )
 
 
-def ring_request(now: float, agents: int, raster: SceneRaster | None = None, model: str = "") -> PredictRequest:
+def ring_request(
+    now: float, agents: int, raster: SceneRaster | None = None, model: str = ""
+) -> PredictRequest:
     """Return the request of one tick."""
     made = [ring_agent(number, now) for number in range(agents)]
     return predict_request(now, made, scene_id=SCENE, model=model, raster=raster)
