@@ -90,7 +90,7 @@ def plot(request: PredictRequest, response: PredictResponse, path: str | PathLik
         raise ValueError("there is nothing to plot: no agent has a state")
     views = forecasts(response)
     low, high = _view(agents, views)
-    figure, axes = _canvas(high - low)
+    figure, axes = canvas(high - low)
     draw_map(axes, request)
     for agent in agents:
         view = views.get(agent.id)
@@ -281,7 +281,7 @@ def _extent(view: Forecast) -> _Floats:
     return np.concatenate([view.means[modes] - spread, view.means[modes] + spread]).reshape(-1, 2)
 
 
-def _canvas(size: _Floats) -> tuple[Figure, Axes]:
+def canvas(size: _Floats) -> tuple[Figure, Axes]:
     """Return an empty figure with the proportions of the view, within limits."""
     inches = np.maximum(LONG_SIDE * size / size.max(), _MIN_SIDE)
     figure = Figure(

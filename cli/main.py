@@ -5,7 +5,20 @@ from typing import Annotated
 
 import typer
 
-from cli import benchmark, consistency, convert, doctor, evaluate, keys, predict, reload, replay, serve, train
+from cli import (
+    benchmark,
+    consistency,
+    convert,
+    doctor,
+    evaluate,
+    keys,
+    maps,
+    predict,
+    reload,
+    replay,
+    serve,
+    train,
+)
 
 app = typer.Typer(
     name="cab-forecast",
@@ -33,6 +46,7 @@ def _options(
 serve.register(app)
 doctor.register(app)
 predict.register(app)
+maps.register(app)
 reload.register(app)
 replay.register(app)
 consistency.register(app)

@@ -48,6 +48,12 @@ def predict(
     ] = False,
     blind: Annotated[bool, typer.Option("--blind", help="Forecast without map and neighbours.")] = False,
     strict: Annotated[bool, typer.Option("--strict", help="Fail if any agent cannot be forecast.")] = False,
+    map_file: Annotated[
+        str | None,
+        typer.Option(
+            "--map", metavar="FILE", help="Use this map for the scene, as cab-forecast map writes it."
+        ),
+    ] = None,
     plot: Annotated[
         Path | None, typer.Option(dir_okay=False, help="Plot the forecasts to a .png, .svg or .pdf file.")
     ] = None,
@@ -61,7 +67,7 @@ def predict(
     ] = None,
 ) -> None:
     """Send one request and show its forecasts; options given here override those in the request."""
-    from cab.forecast.v1.prediction_service_pb2 import PredictRequest
+    from cab.forecast.v1.prediction_service_pb2 import PredictRequest, SceneRaster
     from cab_forecast.demo import demo_request
     from cli.messages import read_message, write_message
 
@@ -79,6 +85,11 @@ def predict(
     try:
         request = demo_request() if request_file == DEMO else read_message(request_file, PredictRequest())
         overrides.apply(request)
+        if map_file is not None:
+            raster = read_message(map_file, SceneRaster())
+            if not raster.HasField("image"):
+                raise ValueError(f"{map_file} holds no SceneRaster: it has no image")
+            request.scene_raster.CopyFrom(raster)
         if save_request is not None:
             write_message(save_request, request)
             return

@@ -31,6 +31,7 @@ def test_help_names_the_commands_and_loads_nothing_heavy() -> None:
         "serve",
         "doctor",
         "predict",
+        "map",
         "reload",
         "replay",
         "consistency",

@@ -50,6 +50,14 @@ def test_the_example_of_the_client(server: Server, capsys: pytest.CaptureFixture
     assert "walker FALLBACK" in capsys.readouterr().out
 
 
+def test_the_example_of_the_maps(server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    [code] = blocks(ROOT / "docs/maps.md", "python")
+    (tmp_path / "docs").symlink_to(ROOT / "docs")
+    monkeypatch.chdir(tmp_path)
+    exec(_here(code, server).replace("timeout=2.0", "timeout=10"), {})  # noqa: S102
+    assert (tmp_path / "own_map.png").stat().st_size > 10_000
+
+
 def test_the_example_of_the_benchmark(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

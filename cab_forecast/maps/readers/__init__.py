@@ -1,0 +1,1 @@
+"""Readers of map files, one module a format."""
