@@ -53,7 +53,7 @@ class UtmProjection:
         self._middle = zone * 6 - 183
         utm = f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}"
         self._transformer: Any = Transformer.from_crs("OGC:CRS84", utm, always_xy=True)
-        self._offset = np.array(self._transformer.transform(longitude, latitude))
+        self._offset: npt.NDArray[np.float64] = np.array(self._transformer.transform(longitude, latitude))
 
     def __call__(self, points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Return the ground positions of points: [N, 2], m.
