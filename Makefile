@@ -4,6 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 NUSCENES := .venv-nuscenes
 AUDIT := .venv-audit
+LOCK := .venv-lock
 PEERS := $(patsubst loadtest/peers/requirements-%.txt,%,$(wildcard loadtest/peers/requirements-*.txt))
 # Triton's Python backend needs libpython as a shared library, as Debian's Python has it.
 PEERS_PYTHON ?= /usr/bin/python3
@@ -73,7 +74,8 @@ peers-install: $(PEERS:%=.venv-peers/%/.installed)  ## create an environment for
 peers: install peers-install  ## compare with other servers around the same network; tables in build/peers
 	$(BIN)/python -m loadtest.peers --out build/peers
 
-faults: install  ## forecast while the track memory is killed, full, slow or hanging; needs redis-server
+faults: install  ## forecast while descriptors, disk, checkpoint, process and Redis fail, a row each; needs redis-server
+	$(BIN)/python -m loadtest.faults
 	$(BIN)/python -m loadtest.redis_faults
 
 docs: install  ## generate the tables of settings and metrics in docs/
@@ -107,8 +109,15 @@ audit: $(AUDIT)/.installed  ## list the image's packages (CycloneDX, build/sbom.
 	  -o build/sbom.json $(AUDIT)/image/bin/python
 	$(AUDIT)/bin/pip-audit --strict --disable-pip --no-deps --progress-spinner off $(AUDIT_FLAGS) -r constraints.txt
 
-lock: install  ## write the installed versions to constraints.txt
+lock: install $(LOCK)/bin/uv  ## write the installed versions to constraints.txt, and the hashes of the image's packages
 	$(BIN)/python -m pip freeze --exclude-editable | sed 's/+cpu$$//' > constraints.txt
+	printf 'hatchling\npsutil\n' | $(LOCK)/bin/uv pip compile --quiet pyproject.toml - \
+	  --extra plot --extra record --extra tracing -c constraints.txt --generate-hashes --no-emit-package torch \
+	  --python-version 3.11.9 --python-platform linux --no-annotate --no-header --upgrade -o requirements-image.txt
+
+$(LOCK)/bin/uv:
+	$(PYTHON) -m venv $(LOCK)
+	$(LOCK)/bin/python -m pip install --quiet --disable-pip-version-check uv==0.13.9
 
 clean:  ## remove the environments and caches
-	rm -rf $(VENV) $(NUSCENES) $(AUDIT) .venv-peers .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) $(NUSCENES) $(AUDIT) $(LOCK) .venv-peers .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

@@ -8,6 +8,7 @@ import sys
 import tomllib
 import zipfile
 from collections.abc import Iterator
+from importlib import metadata
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -136,6 +137,30 @@ def test_every_dependency_is_pinned() -> None:
         name = canonicalize_name(requirement.name)
         if name != PROJECT["project"]["name"]:
             assert requirement.specifier.contains(pinned[name]), name
+
+
+def test_the_image_installs_what_is_pinned_by_hash() -> None:
+    """Hashed are all that the image can hold except torch, in the versions that the tests run with."""
+    text = (ROOT / "requirements-image.txt").read_text()
+    entries = re.findall(
+        r"^([\w.-]+)==(\S+) \\\n    --hash=sha256:[0-9a-f]{64}(?: \\)?\n", text, re.MULTILINE
+    )
+    assert len(entries) == text.count("==")
+    hashed = {canonicalize_name(name): version for name, version in entries}
+    pins = (line.split("==") for line in (ROOT / "constraints.txt").read_text().splitlines())
+    pinned = {canonicalize_name(name): version for name, version in pins}
+    # What pip freeze leaves out
+    assert {name: hashed[name] for name in hashed.keys() - {"setuptools"}}.items() <= pinned.items()
+    extras = PROJECT["project"]["optional-dependencies"]
+    needed = [*PROJECT["project"]["dependencies"], *PROJECT["build-system"]["requires"], "psutil"]
+    needed += [*extras["plot"], *extras["record"], *extras["tracing"]]
+    names = {canonicalize_name(Requirement(each).name) for each in needed}
+    assert names - hashed.keys() == {"torch"}
+    # What these need in turn, as far as the installed packages tell
+    for name in names - {"torch"}:
+        for each in map(Requirement, metadata.requires(name) or ()):
+            if each.marker is None or each.marker.evaluate({"extra": ""}):
+                assert canonicalize_name(each.name) in hashed, f"{each.name}, which {name} needs"
 
 
 def test_the_licence_names_that_of_the_weights() -> None:

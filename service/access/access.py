@@ -23,6 +23,7 @@ class Access:
         Raises:
             SettingsError: a file is missing or broken.
         """
+        self._metrics = metrics
         self.gate = Gate(settings, metrics)
         try:
             self.certificates = watch_certificates(settings)
@@ -45,5 +46,7 @@ class Access:
         """Take over changes of the files now."""
         if await asyncio.to_thread(self.gate.refresh):
             self.gate.apply()
+        self._metrics.broken_files.labels("keys").set(self.gate.broken)
         if self.certificates is not None:
             await asyncio.to_thread(self.certificates.refresh)
+            self._metrics.broken_files.labels("certificates").set(self.certificates.broken)

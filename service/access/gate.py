@@ -58,6 +58,11 @@ class Gate:
         """True if callers need a key or token."""
         return bool(self._tokens) or self._file is not None
 
+    @property
+    def broken(self) -> bool:
+        """True if the file of keys has changed and cannot be read, so that the former keys are let in."""
+        return self._file is not None and self._file.broken
+
     def refresh(self) -> bool:
         """Read the file of keys again if it changed, in any thread; if this is True, ``apply`` them."""
         return self._file is not None and self._file.refresh()

@@ -32,6 +32,8 @@ class Watched(Generic[_T]):
         self._seen = self._signature()
         self.value = read()
         """Latest value that could be read."""
+        self.broken = False
+        """True if the files have changed since, and cannot be read."""
 
     def refresh(self) -> bool:
         """Read the files again if they changed. This may be called from any thread, but not from two.
@@ -50,6 +52,7 @@ class Watched(Generic[_T]):
         if self._signature() != signature:  # the files are being written: wait for the rest
             return False
         self._seen = signature
+        self.broken = value is None
         if value is None:
             _log.error(f"{self._name} not reloaded; the former ones stay in use", reason=str(problem))
             return False

@@ -248,18 +248,29 @@ class DataPlane:
         await self._rasters.close()
         await asyncio.to_thread(self._threads.shutdown, cancel_futures=True)
 
-    async def list_models(self, request: pb.ListModelsRequest) -> pb.ListModelsResponse:
+    async def list_models(
+        self, request: pb.ListModelsRequest, caller: str | None = None
+    ) -> pb.ListModelsResponse:
         """Return all models.
+
+        Args:
+            request: the request.
+            caller: name of the caller's key, who may have a default model; None: there is none.
 
         Raises:
             Unavailable: the server is not ready.
         """
         self._lifecycle.require_ready()
         catalog = self._pipeline.catalog
-        return pb.ListModelsResponse(models=[catalog.describe(info) for info in catalog.models.infos()])
+        models = [catalog.describe(info, caller) for info in catalog.models.infos()]
+        return pb.ListModelsResponse(models=models)
 
-    async def get_model(self, request: pb.GetModelRequest) -> pb.GetModelResponse:
+    async def get_model(self, request: pb.GetModelRequest, caller: str | None = None) -> pb.GetModelResponse:
         """Return one model.
+
+        Args:
+            request: the request.
+            caller: name of the caller's key, as in ``list_models``.
 
         Raises:
             BadField: the name is missing.
@@ -270,7 +281,7 @@ class DataPlane:
         if not request.name:
             raise BadField("name", "is required")
         catalog = self._pipeline.catalog
-        return pb.GetModelResponse(model=catalog.describe(catalog.get(request.name).info))
+        return pb.GetModelResponse(model=catalog.describe(catalog.get(request.name).info, caller))
 
     async def get_version(self, request: pb.GetVersionRequest) -> pb.GetVersionResponse:
         """Return the version of the server, in every phase."""

@@ -155,6 +155,14 @@ class Metrics:
         for cause in ("watcher", "busy"):
             self.frames_dropped.labels(cause)
         self.keys = KeyMetrics(self.registry)
+        self.broken_files = Gauge(
+            "forecast_broken_files",
+            "1 while changed files of keys or certificates cannot be read, so the former ones are in use.",
+            ["files"],
+            registry=self.registry,
+        )
+        for files in ("keys", "certificates"):
+            self.broken_files.labels(files)
         self.raster_lookups = Counter(
             "forecast_raster_lookups_total",
             "Scene rasters with a digest by where they came from: sent whole; named by the digest alone and "

@@ -38,19 +38,19 @@ _log = structlog.get_logger(__name__)
 _Message = TypeVar("_Message", bound=Message)
 
 
-UNARY_METHODS: Mapping[Route[Any, Any], Callable[[DataPlane, Any], Awaitable[Message]]] = {
-    LIST_MODELS: lambda dataplane, request: dataplane.list_models(request),
-    GET_MODEL: lambda dataplane, request: dataplane.get_model(request),
-    GET_VERSION: lambda dataplane, request: dataplane.get_version(request),
-    GET_AGENT_CONSISTENCY: lambda dataplane, request: dataplane.consistency.get_agent(request),
-    GET_SCENE_CONSISTENCY: lambda dataplane, request: dataplane.consistency.get_scene(request),
-    LIST_MODEL_CONSISTENCY: lambda dataplane, request: dataplane.consistency.list_models(request),
-    RESET_SCENE: lambda dataplane, request: dataplane.consistency.reset_scene(request),
-    LIST_SCENES: lambda dataplane, request: dataplane.scenes.list_scenes(request),
-    RELOAD_MODELS: lambda dataplane, request: dataplane.reload_models(request),
+UNARY_METHODS: Mapping[Route[Any, Any], Callable[[DataPlane, Any, str | None], Awaitable[Message]]] = {
+    LIST_MODELS: lambda dataplane, request, caller: dataplane.list_models(request, caller),
+    GET_MODEL: lambda dataplane, request, caller: dataplane.get_model(request, caller),
+    GET_VERSION: lambda dataplane, request, _: dataplane.get_version(request),
+    GET_AGENT_CONSISTENCY: lambda dataplane, request, _: dataplane.consistency.get_agent(request),
+    GET_SCENE_CONSISTENCY: lambda dataplane, request, _: dataplane.consistency.get_scene(request),
+    LIST_MODEL_CONSISTENCY: lambda dataplane, request, _: dataplane.consistency.list_models(request),
+    RESET_SCENE: lambda dataplane, request, _: dataplane.consistency.reset_scene(request),
+    LIST_SCENES: lambda dataplane, request, _: dataplane.scenes.list_scenes(request),
+    RELOAD_MODELS: lambda dataplane, request, _: dataplane.reload_models(request),
 }
-"""Functions that execute the unary methods except Predict and Explain, whose requests are decoded off the
-event loop."""
+"""Functions that execute the unary methods, of data plane, request and the name of the caller's key; except
+Predict and Explain, whose requests are decoded off the event loop."""
 
 STREAMS: Mapping[Route[Any, Any], Callable[[DataPlane, Any], AsyncIterator[Event]]] = {
     WATCH_SCENE: lambda dataplane, request: dataplane.consistency.watch_scene(request),

@@ -5,19 +5,17 @@ import re
 from pathlib import Path
 from typing import Any
 
-import httpx
 import numpy as np
 import pytest
-import yaml
 
 from cab_forecast import AsyncClient, scene_raster
-from tests.deploy.files import PROMETHEUS, job_name, read_yaml
+from tests.deploy.files import job_name
 from tests.deploy.test_dashboard import PANELS
 from tests.model.checkpoints import copy_bundled
 from tests.service.requests import make_request
 from tests.service.tracks import made_up
-from tests.system.fleet import Fleet, fleet, free_port, until
-from tests.system.programs import program
+from tests.system.fleet import Fleet, fleet, until
+from tests.system.prometheus import prometheus
 
 pytestmark = pytest.mark.system
 _MODEL = "trajectron-no-context"
@@ -31,26 +29,6 @@ def query_of(target: dict[str, Any]) -> str:
     for name, value in _VARIABLES.items():
         query = query.replace(name, value)
     return query
-
-
-def write_config(folder: Path, made: Fleet) -> Path:
-    """Write the files of deploy/prometheus with the addresses of a fleet and short intervals."""
-    (folder / "key").write_text(_TOKEN, encoding="ascii")
-    config = read_yaml(PROMETHEUS / "prometheus.yml")
-    config["global"] = {"scrape_interval": "1s", "evaluation_interval": "1s"}
-    for name in config["rule_files"]:  # beside the configuration
-        rules = read_yaml(PROMETHEUS / name)
-        for group in rules["groups"]:
-            group["interval"] = "1s"
-        (folder / name).write_text(yaml.safe_dump(rules), encoding="utf-8")
-    del config["alerting"]
-    servers, balancer = config["scrape_configs"]
-    del servers["dns_sd_configs"]
-    servers["authorization"] = {"credentials_file": str(folder / "key")}
-    servers["static_configs"] = [{"targets": [each.http for each in made.replicas]}]
-    balancer["static_configs"] = [{"targets": [re.sub(r"http://|/metrics", "", made.metrics)]}]
-    (folder / "prometheus.yml").write_text(yaml.safe_dump(config), encoding="utf-8")
-    return folder / "prometheus.yml"
 
 
 async def traffic(made: Fleet) -> None:
@@ -80,17 +58,11 @@ async def test_every_panel_of_the_dashboard_has_data(tmp_path: Path) -> None:
         "record": tmp_path / "record",
         "shadow": "kalman@1.0.0:1.0",
     }
-    address = f"127.0.0.1:{free_port()}"
     async with fleet(tmp_path, **settings) as made:
-
-        def ask(query: str) -> list[Any]:
-            response = httpx.get(f"http://{address}/api/v1/query", params={"query": query})
-            response.raise_for_status()
-            found: list[Any] = response.json()["data"]["result"]
-            return found
-
-        config = ["--config.file", str(write_config(tmp_path, made)), "--web.listen-address", address]
-        with program("prometheus", *config, "--storage.tsdb.path", str(tmp_path / "data")):
+        balancer = re.sub(r"http://|/metrics", "", made.metrics)
+        servers = [each.http for each in made.replicas]
+        async with prometheus(tmp_path, _TOKEN, servers, balancer) as scraping:
+            ask = scraping.ask
             await until(lambda: len(ask(f'up{{job="{job_name()}"}} == 1')) == 2, "both replicas are scraped")
             await until(lambda: ask('up{job="haproxy"} == 1'), "HAProxy is scraped")
             await traffic(made)

@@ -89,12 +89,12 @@ class Handlers:
         return _handler(grpc.unary_unary_rpc_method_handler, handle)
 
     def _unary(
-        self, route: Route[Request, Response], behavior: Callable[[Request], Awaitable[Message]]
+        self, route: Route[Request, Response], behavior: Callable[[Request, str | None], Awaitable[Message]]
     ) -> "grpc.RpcMethodHandler[bytes, bytes]":
         """Return the handler of a method with small requests."""
 
-        async def parse_and_execute(incoming: Incoming, _: Grant, __: Context) -> Message:
-            return await behavior(parse_message(route.request, await self._read(incoming)))
+        async def parse_and_execute(incoming: Incoming, grant: Grant, _: Context) -> Message:
+            return await behavior(parse_message(route.request, await self._read(incoming)), grant.caller.name)
 
         return self._bytes(route, parse_and_execute)
 

@@ -145,7 +145,7 @@ class Endpoints:
             return _message_response(message, outgoing)
         return await asyncio.to_thread(_message_response, message, outgoing)
 
-    async def _execute(self, route: Route[Any, Any], request: Request, _: Grant) -> Response:
+    async def _execute(self, route: Route[Any, Any], request: Request, grant: Grant) -> Response:
         """Execute a unary method with small messages."""
         incoming = request_format(request.headers) if route.verb == "POST" else Format.JSON
         outgoing = response_format(request.headers, preferred=incoming)
@@ -157,7 +157,8 @@ class Endpoints:
             message = route.request(**request.path_params)
         else:
             message = read_query(route.request, request.query_params)
-        return _message_response(await UNARY_METHODS[route](self._dataplane, message), outgoing)
+        response = await UNARY_METHODS[route](self._dataplane, message, grant.caller.name)
+        return _message_response(response, outgoing)
 
     async def _watch(self, route: Route[Any, Any], request: Request) -> Response:
         def events() -> AsyncIterator[Event]:

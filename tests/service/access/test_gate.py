@@ -150,8 +150,10 @@ def test_a_broken_file_changes_nothing_and_is_logged_once(file: Path, broken: st
     assert entry["event"] == "keys not reloaded; the former ones stay in use"
     assert str(file) in entry["reason"]
     assert gate.identify("Bearer first").name == "one"
+    assert gate.broken
     file.write_text(good)
     assert gate.refresh()
+    assert not gate.broken
 
 
 async def test_a_file_without_keys_lets_nobody_in(file: Path) -> None:

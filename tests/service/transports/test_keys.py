@@ -139,6 +139,12 @@ async def test_a_key_can_have_a_default_model_of_its_own(file: Path) -> None:
         for predict in TRANSPORTS.values():
             assert (await predict(server, make_request(), held_by("truck"))).model.name == "other"
             assert (await predict(server, make_request(), held_by("car"))).model.name == "fake"
+        for transport in TRANSPORTS:
+            for holder, default in (("truck", "other"), ("car", "fake")):
+                async with client(server, transport, holder) as calls:
+                    listed = await calls.list_models()
+                    assert [model.name for model in listed if model.is_default] == [default]
+                    assert (await calls.get_model(default)).is_default
 
 
 async def test_agents_in_progress_are_for_one_key_alone(transport: str, file: Path) -> None:

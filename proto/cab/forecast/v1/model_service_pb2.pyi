@@ -142,7 +142,7 @@ class Model(_message.Message):
     version: _builtins.str
     protocol: Global___InputProtocol.ValueType
     is_default: _builtins.bool
-    """True for the model that answers when a request names none."""
+    """True for the model that answers when a request of this caller names none: API keys can have defaults of their own."""
     description: _builtins.str
     """One sentence on the method."""
     horizon: _builtins.float
