@@ -187,7 +187,7 @@ async def call_anew(of: Victim) -> list[str]:
                 return error.code().name
         return "OK"
 
-    return await asyncio.gather(rest(), grpc_call())
+    return list(await asyncio.gather(rest(), grpc_call()))
 
 
 async def run_row(fault: Fault, of: Victim, seconds: float) -> Row:
