@@ -24,7 +24,15 @@ MAX_PICTURE_BYTES = 150_000
 _FOLDERS = {folder.name for folder in ROOT.iterdir() if folder.is_dir() and not folder.name.startswith(".")}
 _PATH = re.compile(r"[\w.-]+(?:/[\w.*-]*)+")
 _MODULE = re.compile(r"(?:model|service|benchmark|loadtest|cab_forecast|cli|docs)(?:\.(?!yml|py|md)\w+)+")
-_FOREIGN_FLAGS = {"--enable-feature", "--build", "--build-arg", "--profile", "--rm", "--nproc-per-node"}
+_FOREIGN_FLAGS = {
+    "--build",
+    "--build-arg",
+    "--enable-feature",
+    "--hash",
+    "--nproc-per-node",
+    "--profile",
+    "--rm",
+}
 """Flags of other programs."""
 
 pages = pytest.mark.parametrize("page", PAGES, ids=name)

@@ -7,10 +7,10 @@ from loadtest.faults import FAULTS, Fault, Row, Victim
 
 
 def test_faults_are_seen_as_the_matrix_says_and_pass() -> None:
-    rows = faults.run(2.0, FAULTS[1:3])
+    rows = faults.run(1.0, FAULTS[1:3])
     assert [row.fault.name for row in rows] == ["out of descriptors", "corrupt checkpoint"]
     assert [problem for row in rows for problem in row.problems()] == []
-    assert all(row.kept["OK"] > 5 for row in rows)
+    assert all(row.kept["OK"] > 3 for row in rows)
 
 
 def test_what_must_not_be_is_told() -> None:
