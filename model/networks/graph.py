@@ -77,13 +77,13 @@ class GraphForward:
     Args:
         network: the network, whose parameters it runs with; the memory is shared.
         context: full or blind.
-        threads: threads of one forward; None: all cores.
+        threads: threads of one forward.
 
     Raises:
         LookupError: there is no graph of that architecture.
     """
 
-    def __init__(self, network: nn.Module, context: Context, threads: int | None) -> None:
+    def __init__(self, network: nn.Module, context: Context, threads: int) -> None:
         if not isinstance(network, AgentFrameNetwork):
             raise LookupError("only networks of the agent's frame have graphs")
         self._context = context
@@ -93,7 +93,7 @@ class GraphForward:
             raise LookupError(f"there is no graph {file.name}")
         self._inputs = tuple(graph_inputs(network.config, seen))
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads or 0
+        options.intra_op_num_threads = threads
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         parameters = network.state_dict()
         # The session reads the parameters in place, so they must live as long as it does

@@ -1,8 +1,10 @@
 """Dynamic batching: calls that wait for the model at the same time share a forward.
 
-A batch starts as soon as the model is free and never waits for more calls: under light load a call runs
-alone, under heavy load batches grow by themselves. The most urgent work goes first
-(``service.predict.scheduler``). Everything except the forward runs on the event loop, so there are no locks.
+A batch starts as soon as a thread of the model is free and never waits for more calls: under light load a
+call runs alone, under heavy load batches grow by themselves. The most urgent work goes first
+(``service.predict.scheduler``). A forward that runs alone uses all cores; forwards that run at the same time
+share them, so that none waits for a core that another thread has. Everything except the forward runs on the
+event loop, so there are no locks.
 """
 
 import asyncio
@@ -19,11 +21,10 @@ import torch
 from model.forecaster import Context, Forecaster, ModelInfo, Prepared, complete
 from model.mixture import TrajectoryMixture
 from model.scenes.scene import AgentType
-from service.cores import whole_cores
 from service.errors import DeadlineExceeded, Internal, Unavailable
 from service.predict.admission import Admission, Call
 from service.predict.scheduler import DeadlineQueue
-from service.predict.torch_threads import set_forward_threads, set_helper_threads
+from service.predict.torch_threads import set_helper_threads
 from service.telemetry.metrics import Metrics
 
 _log = structlog.get_logger(__name__)
@@ -108,32 +109,48 @@ class _Entry:
         return self.done.done()
 
 
+class _Slot:
+    """Thread of forwards, and the batch that is in it."""
+
+    def __init__(self, number: int) -> None:
+        self.thread = ThreadPoolExecutor(1, thread_name_prefix=f"forward-{number}")
+        self.batch: list[_Entry] = []
+        """Empty while the slot is free."""
+        self.since = 0.0
+        """Start of the batch, by ``time.perf_counter``."""
+        self.until = 0.0
+        """Time on the event loop's clock when the batch should be done."""
+        self.task: asyncio.Task[None] | None = None
+
+
 class Batcher:
-    """Queue of jobs and thread of the forward."""
+    """Queue of jobs and threads of the forward."""
 
     def __init__(
-        self, max_batch_agents: int, admission: Admission, metrics: Metrics, threads: int | None = None
+        self,
+        max_batch_agents: int,
+        admission: Admission,
+        metrics: Metrics,
+        widths: Sequence[int] = (1,),
     ) -> None:
         """
         Args:
             max_batch_agents: max number of agents in one forward.
             admission: admits the calls whose jobs are queued.
             metrics: the metrics that count batches.
-            threads: number of threads of the forward; None: torch's choice, the physical cores.
+            widths: number of torch threads of a forward that runs alone; if there is a second number, two
+                forwards may run at the same time, with so many each (``torch_threads.forward_widths``).
         """
         self._max_batch = max_batch_agents
         self._admission = admission
         self._metrics = metrics
         self._costs = admission.costs
         self._queue: DeadlineQueue[_Entry] = DeadlineQueue(self._costs)
-        self._running: list[_Entry] = []
-        self._running_since = 0.0
         self._wake = asyncio.Event()
-        self._thread = ThreadPoolExecutor(
-            1, thread_name_prefix="forward", initializer=set_forward_threads, initargs=(threads,)
-        )
+        self._widths = tuple(widths)
+        self._slots = [_Slot(number) for number in range(len(widths))]
         self._cutters = ThreadPoolExecutor(
-            threads or whole_cores(), thread_name_prefix="patches", initializer=set_helper_threads
+            widths[0], thread_name_prefix="patches", initializer=set_helper_threads
         )
         self._worker: asyncio.Task[None] | None = None
         self._crashed = False
@@ -141,8 +158,9 @@ class Batcher:
 
     @property
     def forward_seconds(self) -> float:
-        """Seconds since the current batch started; 0 while the model is free."""
-        return time.perf_counter() - self._running_since if self._running else 0.0
+        """Seconds since the oldest batch in the model started; 0 while the model is free."""
+        now = time.perf_counter()
+        return max((now - slot.since for slot in self._slots if slot.batch), default=0.0)
 
     def start(self, on_crash: Callable[[], None] | None = None) -> None:
         """Start the worker on the running event loop.
@@ -152,16 +170,18 @@ class Batcher:
         """
         self._on_crash = on_crash
         self._worker = asyncio.create_task(self._work(), name="batcher")
-        self._worker.add_done_callback(self._check_worker)
+        self._worker.add_done_callback(self._check)
 
     async def stop(self) -> None:
-        """Fail the queued jobs, and wait for the batch that is in the model."""
-        if self._worker is not None:
-            self._worker.cancel()
-            await asyncio.gather(self._worker, return_exceptions=True)
+        """Fail the queued jobs, and wait for the batches that are in the model."""
+        tasks = [task for task in (self._worker, *(slot.task for slot in self._slots)) if task is not None]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
         self._fail(self._queue, Unavailable("the server is stopping"))
         self._queue.clear()
-        await asyncio.to_thread(self._thread.shutdown)
+        for slot in self._slots:
+            await asyncio.to_thread(slot.thread.shutdown)
         self._cutters.shutdown()
 
     async def run(self, jobs: Sequence[Job], call: Call) -> list[Outcome]:
@@ -201,14 +221,21 @@ class Batcher:
         call.delivered = asyncio.get_running_loop().time()
         return [combine([entry.done.result() for entry in part]) for part in parts]
 
-    async def run_in_model_thread(self, job: Job) -> float:
-        """Run a job past the queue, for warm-up, and learn how long it takes: the seconds that it returns."""
-        return (await self._run_alone(job)).inference
+    async def run_in_model_threads(self, job: Job) -> float:
+        """Run a job past the queue, for warm-up, once with each number of threads, and learn how long it takes.
+
+        Returns:
+            The seconds of the slowest forward.
+        """
+        slowest = 0.0
+        for slot, width in reversed(list(zip(self._slots, self._widths, strict=True))):
+            slowest = max(slowest, (await self._run_alone(job, slot, width)).inference)
+        return slowest
 
     @property
     def is_free(self) -> bool:
         """True if no call waits for the model or is in it."""
-        return not (self._running or self._admission.waiting or self._queue)
+        return not (self._busy or self._admission.waiting or self._queue)
 
     async def until_free(self, until: float = math.inf) -> bool:
         """Wait until no call waits for the model or is in it, and return True.
@@ -232,11 +259,11 @@ class Batcher:
 
     async def run_spare(self, job: Job) -> Outcome:
         """Run a job past the queue. The caller waits until ``is_free``, and counts the work."""
-        return await self._run_alone(job, usual=False)
+        return await self._run_alone(job, self._slots[-1], self._widths[-1], usual=False)
 
-    async def _run_alone(self, job: Job, usual: bool = True) -> Outcome:
-        mixture, seconds = await self.call_in_model_thread(
-            _forward, job, [job.inputs], job.steps, self._cutters
+    async def _run_alone(self, job: Job, slot: _Slot, width: int, usual: bool = True) -> Outcome:
+        mixture, seconds = await asyncio.get_running_loop().run_in_executor(
+            slot.thread, _forward, job, [job.inputs], job.steps, width, self._cutters
         )
         self._costs.measure(job.key, job.agents, seconds, usual=usual)
         return Outcome(mixture, 0.0, seconds, job.agents)
@@ -246,8 +273,8 @@ class Batcher:
         self._costs.forget({id(forecaster) for forecaster in forecasters})
 
     async def call_in_model_thread(self, function: Callable[..., _T], *arguments: object) -> _T:
-        """Call a function in the thread of the forward, past the queue."""
-        return await asyncio.get_running_loop().run_in_executor(self._thread, function, *arguments)
+        """Call a function in a thread of the forward, past the queue."""
+        return await asyncio.get_running_loop().run_in_executor(self._slots[0].thread, function, *arguments)
 
     def _entries(self, job: Job, call: Call) -> list[_Entry]:
         """Return the job in parts that fit a batch."""
@@ -268,24 +295,44 @@ class Batcher:
             if not entry.done.cancel() and not entry.done.cancelled():
                 entry.done.exception()  # retrieved, or asyncio would log that it never was
 
+    @property
+    def _busy(self) -> list[_Slot]:
+        return [slot for slot in self._slots if slot.batch]
+
     async def _work(self) -> None:
+        """Start batches as long as a slot is free and work is queued."""
         while True:
             await self._wake.wait()
-            self._running = self._take_batch()
-            if self._running:
-                self._running_since = time.perf_counter()
-                await self._run_batch(self._running, self._running_since)
-                self._running = []
-                self._admission.busy_until = None
-            elif not self._queue:
-                self._wake.clear()
+            self._wake.clear()
+            while self._queue and (slot := next((one for one in self._slots if not one.batch), None)):
+                slot.batch = self._take_batch()
+                if slot.batch:
+                    self._start(slot)
 
-    async def _run_batch(self, batch: Sequence[_Entry], started: float) -> None:
+    def _start(self, slot: _Slot) -> None:
+        """Start the forward of a slot's batch: with all cores if it is alone, else with a part of them."""
+        loop = asyncio.get_running_loop()
+        batch = slot.batch
+        is_alone = len(self._busy) == 1 and not self._queue
+        width = self._widths[0 if is_alone else -1]
+        slot.since = time.perf_counter()
+        slot.until = loop.time() + self._costs.seconds(batch[0].key, sum(entry.agents for entry in batch))
+        self._tell_admission()
+        slot.task = asyncio.create_task(self._run_batch(slot, width), name="forward")
+        slot.task.add_done_callback(self._check)
+
+    def _tell_admission(self) -> None:
+        """Tell the admission when a slot should be free."""
+        ends = [slot.until for slot in self._busy]
+        self._admission.busy_until = min(ends) if len(ends) == len(self._slots) else None
+
+    async def _run_batch(self, slot: _Slot, width: int) -> None:
+        batch, started = slot.batch, slot.since
         job = batch[0].job
         steps = max(entry.job.steps for entry in batch)
         parts = [entry.inputs for entry in batch]
         running = asyncio.get_running_loop().run_in_executor(
-            self._thread, _forward, job, parts, steps, self._cutters
+            slot.thread, _forward, job, parts, steps, width, self._cutters
         )
         try:
             mixture, seconds = await asyncio.shield(running)
@@ -301,18 +348,23 @@ class Batcher:
                 request_ids=sorted({entry.call.request_id for entry in batch}),
             )
             self._fail(batch, Internal())
-            return
-        self._measure(batch, started, seconds)
-        self._deliver(batch, mixture, started, seconds)
+        else:
+            self._measure(batch, started, seconds)
+            self._deliver(batch, mixture, started, seconds)
+        slot.batch = []
+        self._tell_admission()
+        self._wake.set()
 
-    def _check_worker(self, worker: "asyncio.Task[None]") -> None:
-        """Fail all calls if the worker has crashed: without it nothing would ever be answered."""
-        if worker.cancelled():
+    def _check(self, worker: "asyncio.Task[None]") -> None:
+        """Fail all calls if a task has crashed: without it nothing would ever be answered."""
+        if worker.cancelled() or worker.exception() is None:
             return
         _log.critical("batcher crashed", exc_info=worker.exception())
         self._crashed = True
-        self._fail([*self._running, *self._queue], Internal())
-        self._running = []
+        for slot in self._slots:
+            self._fail(slot.batch, Internal())
+            slot.batch = []
+        self._fail(self._queue, Internal())
         self._queue.clear()
         if self._on_crash is not None:
             self._on_crash()
@@ -326,8 +378,6 @@ class Batcher:
             entry.done.set_exception(DeadlineExceeded("the deadline passed while the call was queued"))
         if batch:
             self._metrics.batches.labels(departure.value).inc()
-            agents = sum(entry.agents for entry in batch)
-            self._admission.busy_until = now + self._costs.seconds(batch[0].key, agents)
         for entry in batch:
             self._admission.release(entry.call, entry.agents)
         return batch
@@ -360,7 +410,7 @@ class Batcher:
 
 
 def _forward(
-    job: Job, parts: Sequence[Prepared], steps: int, cutters: Executor
+    job: Job, parts: Sequence[Prepared], steps: int, width: int, cutters: Executor
 ) -> tuple[TrajectoryMixture, float]:
     """Run one forward of the job's forecaster over the joined parts.
 
@@ -368,7 +418,8 @@ def _forward(
         job: a job of the batch.
         parts: the agents of the batch.
         steps: number of steps.
-        cutters: threads that cut map patches.
+        width: number of threads of the forward.
+        cutters: threads that cut map patches; with one thread the forward's own cuts them.
 
     Returns:
         The mixture, and the seconds that it took.
@@ -377,9 +428,11 @@ def _forward(
         RuntimeError: the mixture is not one of the expected agents, modes and steps.
     """
     started = time.perf_counter()
+    if torch.get_num_threads() != width:
+        torch.set_num_threads(width)
     with torch.inference_mode():
         agents = sum(map(len, parts))
-        features = complete(parts, cutters if agents >= _CUT_IN_THREADS else None)
+        features = complete(parts, cutters if width > 1 and agents >= _CUT_IN_THREADS else None)
         mixture = job.forecaster.forecast(features, job.agent_type, job.context, steps)
     require_shapes(job.forecaster.info, mixture, agents, steps)
     return mixture, time.perf_counter() - started

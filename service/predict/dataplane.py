@@ -22,7 +22,7 @@ from service.predict.rasters.library import RasterLibrary
 from service.predict.rasters.shared import SharedRasters
 from service.predict.reload import Load, Reloader
 from service.predict.shadow import Shadow
-from service.predict.torch_threads import forward_threads, set_helper_threads
+from service.predict.torch_threads import forward_widths, set_helper_threads
 from service.recording.factory import make_recorder
 from service.scenes.fanout import FrameFanout
 from service.scenes.live import LiveScenes
@@ -56,7 +56,7 @@ class DataPlane:
         self._references = ModelReferences()
         self._admission = Admission(settings.max_batch_agents, settings.max_queue_agents, metrics)
         self._batcher = Batcher(
-            settings.max_batch_agents, self._admission, metrics, threads=forward_threads(settings.threads)
+            settings.max_batch_agents, self._admission, metrics, forward_widths(settings.threads)
         )
         self._threads = ThreadPoolExecutor(
             min(_MAX_WORKERS, whole_cores() + 1),

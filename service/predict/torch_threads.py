@@ -2,7 +2,8 @@
 
 Every thread that runs a parallel section gets an OpenMP team of its own. Once the teams together exceed the
 cores, their members sleep between sections instead of spinning: a forward of hundreds of short sections then
-takes four times as long. Therefore only the thread of the forward has a team.
+takes four times as long. Therefore only forwards have teams, and forwards that run at the same time share the
+cores.
 """
 
 import os
@@ -15,26 +16,22 @@ _CORES = torch.get_num_threads()
 """torch's choice when the process starts: the physical cores."""
 
 
-def forward_threads(threads: int | None) -> int | None:
-    """Return the number of threads of a forward; None: one for each physical core.
+def forward_widths(threads: int | None) -> tuple[int, ...]:
+    """Return the number of threads of a forward that runs alone, and of each of two at the same time.
 
-    More threads than a CPU quota allows would use it up early in each period and then stand still together.
-
-    Args:
-        threads: the setting; None: as many as the quota allows, at most one for each physical core.
-    """
-    if threads is not None or usable_cores() >= len(os.sched_getaffinity(0)):
-        return threads
-    return min(_CORES, whole_cores())
-
-
-def set_forward_threads(threads: int | None) -> None:
-    """Set the team size of the calling thread, which is that of the forward.
+    Two forwards of half the cores each finish more than one after the other with all: the threads of one
+    never wait for each other while other work of the server has a core. With one thread there is no second
+    forward.
 
     Args:
-        threads: the number of threads; None: torch's choice.
+        threads: the setting; None: as many as the quota allows, at most one for each physical core. More
+            threads than a CPU quota allows would use it up early in each period and then stand still
+            together.
     """
-    torch.set_num_threads(threads or _CORES)
+    if threads is None:
+        limited = usable_cores() < len(os.sched_getaffinity(0))
+        threads = min(_CORES, whole_cores()) if limited else _CORES
+    return (threads,) if threads == 1 else (threads, threads // 2)
 
 
 def set_helper_threads() -> None:

@@ -51,7 +51,7 @@ async def warm_up(
         for kind in info.agent_types:
             for context in info.contexts:
                 for job in await batcher.call_in_model_thread(_jobs, forecaster, kind, context, sizes):
-                    seconds = await batcher.run_in_model_thread(job)
+                    seconds = await batcher.run_in_model_threads(job)
                     forwards += 1
                     if seconds > max_seconds:
                         break

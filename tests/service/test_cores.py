@@ -7,7 +7,7 @@ import pytest
 
 from service.cores import usable_cores, whole_cores
 from service.predict import torch_threads
-from service.predict.torch_threads import forward_threads
+from service.predict.torch_threads import forward_widths
 
 ALL = len(os.sched_getaffinity(0))
 V2 = "sys/fs/cgroup"
@@ -63,14 +63,14 @@ def test_without_control_groups_all_cores_may_be_used(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("setting", "quota", "expected"),
-    [(None, 2.5, 2), (None, 0.5, 1), (None, 100.0, 4), (None, 8.0, None), (3, 1.0, 3)],
+    [(None, 2.5, (2, 1)), (None, 0.5, (1,)), (None, 100.0, (4, 2)), (None, 8.0, (4, 2)), (3, 1.0, (3, 1))],
 )
 def test_a_quota_bounds_the_threads_of_the_forward(
-    monkeypatch: pytest.MonkeyPatch, setting: int | None, quota: float, expected: int | None
+    monkeypatch: pytest.MonkeyPatch, setting: int | None, quota: float, expected: tuple[int, ...]
 ) -> None:
     cores = 8 if quota == 8.0 else 128
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
     monkeypatch.setattr(torch_threads, "usable_cores", lambda: quota)
     monkeypatch.setattr(torch_threads, "whole_cores", lambda: max(int(quota), 1))
     monkeypatch.setattr(torch_threads, "_CORES", 4)
-    assert forward_threads(setting) == expected
+    assert forward_widths(setting) == expected

@@ -393,7 +393,7 @@ async def test_a_second_forward_needs_no_place(batcher: Batcher, fake: FakeForec
 
 async def test_warm_up_goes_past_the_queue(batcher: Batcher, fake: FakeForecaster) -> None:
     fake.free.set()
-    await batcher.run_in_model_thread(job(fake, 30))
+    await batcher.run_in_model_threads(job(fake, 30))
     assert fake.batches == [(VEHICLE, 30, Context.FULL, 12)]
 
 
@@ -406,7 +406,7 @@ async def test_threads_of_the_forward() -> None:
             return super().forecast(*arguments, **named)
 
     before = torch.get_num_threads()
-    batcher = Batcher(8, Admission(8, 20, Metrics()), Metrics(), threads=1)
+    batcher = Batcher(8, Admission(8, 20, Metrics()), Metrics(), (1,))
     batcher.start()
     try:
         await submit(batcher, job(Counting(), 1))
@@ -414,3 +414,81 @@ async def test_threads_of_the_forward() -> None:
         await batcher.stop()
         torch.set_num_threads(before)
     assert seen == [(1, True)]
+
+
+async def entered_again(fake: FakeForecaster) -> None:
+    """Wait until another forward has begun."""
+    assert await asyncio.to_thread(fake.entered.wait, 10)
+    fake.entered.clear()
+
+
+@pytest.fixture
+async def pair(admission: Admission) -> AsyncIterator[Batcher]:
+    """A batcher with two forwards at a time: four threads for one alone, two for each of two."""
+    before = torch.get_num_threads()
+    made = Batcher(8, admission, Metrics(), (4, 2))
+    made.start()
+    yield made
+    await made.stop()
+    torch.set_num_threads(before)
+
+
+async def test_two_forwards_run_at_the_same_time_and_share_the_threads(
+    pair: Batcher, fake: FakeForecaster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    threads = []
+    forecast = fake.forecast
+
+    def count(*arguments, **named):  # type: ignore[no-untyped-def]
+        threads.append(torch.get_num_threads())
+        return forecast(*arguments, **named)
+
+    monkeypatch.setattr(fake, "forecast", count)
+    calls = []
+    for x in (10.0, 20.0):
+        calls.append(submit(pair, job(fake, 2, x=x)))
+        await entered_again(fake)
+    assert len(fake.batches) == 2
+    third = submit(pair, job(fake, 3, x=30.0))
+    await settle()
+    assert len(fake.batches) == 2
+    fake.free.set()
+    origins = [[float(x) for x in (await call)[0].mixture.origin[:, 0]] for call in (*calls, third)]
+    assert origins == [[10, 11], [20, 21], [30, 31, 32]]
+    assert threads[:2] == [4, 2]
+
+
+async def test_admission_knows_when_a_forward_ends_only_if_all_are_taken(
+    pair: Batcher, admission: Admission, fake: FakeForecaster
+) -> None:
+    first = submit(pair, job(fake, 1))
+    await entered_again(fake)
+    assert admission.busy_until is None
+    second = submit(pair, job(fake, 1))
+    await entered_again(fake)
+    assert admission.busy_until is not None
+    assert not pair.is_free
+    fake.free.set()
+    await asyncio.gather(first, second)
+    await settle()
+    assert admission.busy_until is None
+    assert pair.is_free
+
+
+async def test_a_failed_forward_leaves_the_other_one_alone(pair: Batcher, fake: FakeForecaster) -> None:
+    broken = FakeForecaster()
+    broken.free.clear()
+    broken.broken = True
+    good, bad = submit(pair, job(fake, 1)), submit(pair, job(broken, 1))
+    await asyncio.gather(entered_again(fake), entered_again(broken))
+    broken.free.set()
+    with pytest.raises(Internal):
+        await bad
+    fake.free.set()
+    assert await good
+
+
+async def test_warm_up_runs_with_each_number_of_threads(pair: Batcher, fake: FakeForecaster) -> None:
+    fake.free.set()
+    await pair.run_in_model_threads(job(fake, 3))
+    assert [agents for _, agents, _, _ in fake.batches] == [3, 3]
