@@ -33,6 +33,8 @@ _T = TypeVar("_T")
 
 _CUT_IN_THREADS = 8
 """Agents of a batch from which on map patches are cut in several threads."""
+_MIN_SECOND_AGENTS = 16
+"""Agents in the queue from which on a second forward starts beside the first in any case."""
 _SPARE_SECONDS = 0.01
 """Seconds that a forward outside the queue may be expected to take."""
 _POLL = 0.002
@@ -222,7 +224,7 @@ class Batcher:
         return [combine([entry.done.result() for entry in part]) for part in parts]
 
     async def run_in_model_threads(self, job: Job) -> float:
-        """Run a job past the queue, for warm-up, once with each number of threads, and learn how long it takes.
+        """Run a job past the queue once with each number of threads, for warm-up, and learn its duration.
 
         Returns:
             The seconds of the slowest forward.
@@ -304,10 +306,25 @@ class Batcher:
         while True:
             await self._wake.wait()
             self._wake.clear()
-            while self._queue and (slot := next((one for one in self._slots if not one.batch), None)):
+            while self._queue and (slot := self._free_slot()):
                 slot.batch = self._take_batch()
                 if slot.batch:
                     self._start(slot)
+
+    def _free_slot(self) -> _Slot | None:
+        """Return the slot for the next batch; None: it waits for the end of a forward.
+
+        A second forward of a few agents only starts if it ends before the first: the first one's end would
+        find more of them, and a shared forward takes less time than two.
+        """
+        free = next((slot for slot in self._slots if not slot.batch), None)
+        busy = self._busy
+        if free is None or not busy or self._queue.agents >= min(_MIN_SECOND_AGENTS, self._max_batch):
+            return free
+        first = next(iter(self._queue))
+        now = asyncio.get_running_loop().time()
+        ends = now + self._costs.seconds(first.key, first.agents)
+        return free if ends < min(slot.until for slot in busy) else None
 
     def _start(self, slot: _Slot) -> None:
         """Start the forward of a slot's batch: with all cores if it is alone, else with a part of them."""

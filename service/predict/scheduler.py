@@ -179,6 +179,11 @@ class DeadlineQueue(Generic[AnyWork]):
     def __iter__(self) -> Iterator[AnyWork]:
         return (entry for _, _, entry in self._entries)
 
+    @property
+    def agents(self) -> int:
+        """Number of agents in the queue."""
+        return sum(entry.agents for entry in self)
+
     def put(self, entry: AnyWork, lag: float = 0.0) -> None:
         """Add an entry.
 

@@ -446,25 +446,25 @@ async def test_two_forwards_run_at_the_same_time_and_share_the_threads(
     monkeypatch.setattr(fake, "forecast", count)
     calls = []
     for x in (10.0, 20.0):
-        calls.append(submit(pair, job(fake, 2, x=x)))
+        calls.append(submit(pair, job(fake, 8, x=x)))
         await entered_again(fake)
     assert len(fake.batches) == 2
-    third = submit(pair, job(fake, 3, x=30.0))
+    third = submit(pair, job(fake, 2, x=30.0))
     await settle()
     assert len(fake.batches) == 2
     fake.free.set()
-    origins = [[float(x) for x in (await call)[0].mixture.origin[:, 0]] for call in (*calls, third)]
-    assert origins == [[10, 11], [20, 21], [30, 31, 32]]
+    origins = [(await call)[0].mixture.origin[:2, 0].tolist() for call in (*calls, third)]
+    assert origins == [[10, 11], [20, 21], [30, 31]]
     assert threads[:2] == [4, 2]
 
 
 async def test_admission_knows_when_a_forward_ends_only_if_all_are_taken(
     pair: Batcher, admission: Admission, fake: FakeForecaster
 ) -> None:
-    first = submit(pair, job(fake, 1))
+    first = submit(pair, job(fake, 8))
     await entered_again(fake)
     assert admission.busy_until is None
-    second = submit(pair, job(fake, 1))
+    second = submit(pair, job(fake, 8))
     await entered_again(fake)
     assert admission.busy_until is not None
     assert not pair.is_free
@@ -479,13 +479,30 @@ async def test_a_failed_forward_leaves_the_other_one_alone(pair: Batcher, fake: 
     broken = FakeForecaster()
     broken.free.clear()
     broken.broken = True
-    good, bad = submit(pair, job(fake, 1)), submit(pair, job(broken, 1))
+    good, bad = submit(pair, job(fake, 8)), submit(pair, job(broken, 8))
     await asyncio.gather(entered_again(fake), entered_again(broken))
     broken.free.set()
     with pytest.raises(Internal):
         await bad
     fake.free.set()
     assert await good
+
+
+@pytest.mark.parametrize(("seconds", "forwards"), [(1e-6, 1), (100.0, 2)])
+async def test_few_agents_wait_for_a_forward_that_ends_before_theirs_would(
+    pair: Batcher, fake: FakeForecaster, seconds: float, forwards: int
+) -> None:
+    pair._costs.measure(job(fake, 8).key, 8, seconds)
+    pair._costs.measure(job(fake, 1).key, 1, 1e-3)
+    first = submit(pair, job(fake, 8))
+    await entered_again(fake)
+    small = submit(pair, job(fake, 1))
+    if forwards == 2:
+        await entered_again(fake)
+    await settle()
+    assert len(fake.batches) == forwards
+    fake.free.set()
+    await asyncio.gather(first, small)
 
 
 async def test_warm_up_runs_with_each_number_of_threads(pair: Batcher, fake: FakeForecaster) -> None:
