@@ -169,8 +169,8 @@ class Settings(BaseSettings):
     drain_seconds: float = Field(default=10.0, ge=0)
     """Seconds that accepted calls get to finish when the server stops."""
     threads: int | None = Field(default=None, ge=1, le=1024)
-    """Number of threads of a forward, and half as many for each of two at a time; None: the physical cores, at
-    most the cores of the CPU quota."""
+    """Number of threads of a forward, and half as many for each of two at a time; None: the physical cores,
+    at most the cores of the CPU quota."""
     engine: Engine = Engine.ONNXRUNTIME
     """Engine of the forward: ``onnxruntime`` runs networks of the agent's frame as one native call and all
     other models in PyTorch; ``eager`` runs all models in PyTorch."""
