@@ -33,13 +33,21 @@ from cab.forecast.v1.routes import (
     GET_VERSION,
     LIST_MODEL_CONSISTENCY,
     LIST_MODELS,
+    LIST_SCENES,
     PREDICT,
     RELOAD_MODELS,
     RESET_SCENE,
+    WATCH_FORECASTS,
     WATCH_SCENE,
     Request,
     Response,
     Route,
+)
+from cab.forecast.v1.scene_service_pb2 import (
+    ListScenesRequest,
+    SceneSummary,
+    WatchForecastsRequest,
+    WatchForecastsResponse,
 )
 from cab_forecast.connection import (
     DEFAULT_RETRIES,
@@ -246,12 +254,29 @@ class Client:
             ForecastError: the stream did not start; the subclass says why. Later errors are raised by its
                 iteration.
         """
-        budget = self._settings.budget(timeout)
-        request = WatchSceneRequest(scene_id=scene_id)
-        stream: Stream[WatchSceneResponse] = self._retrying(budget)(
-            self._transport.open, WATCH_SCENE, request, budget
-        )
-        return stream
+        return self._open(WATCH_SCENE, WatchSceneRequest(scene_id=scene_id), timeout)
+
+    def list_scenes(self, timeout: float | None = None) -> list[SceneSummary]:
+        """Return the scenes that are being forecast, the one that was called last first.
+
+        Raises:
+            ForecastError: the call failed; the subclass says why.
+        """
+        return list(self._call(LIST_SCENES, ListScenesRequest(), timeout).scenes)
+
+    def watch_forecasts(self, scene_id: str, timeout: float | None = None) -> Stream[WatchForecastsResponse]:
+        """Stream a scene's maps and forecasts from now on, until the server drains or the stream is closed.
+
+        Args:
+            scene_id: the scene, as in the Predict requests.
+            timeout: seconds until the stream starts; None: the client's. The stream itself has no timeout.
+
+        Raises:
+            Overloaded: the server has too many watchers.
+            ForecastError: the stream did not start; the subclass says why. Later errors are raised by its
+                iteration.
+        """
+        return self._open(WATCH_FORECASTS, WatchForecastsRequest(scene_id=scene_id), timeout)
 
     def reload_models(self, timeout: float | None = None) -> ReloadModelsResponse:
         """Make the server read its folder of models again: what took over, what is gone, what was refused.
@@ -284,6 +309,13 @@ class Client:
     def _send(self, route: Route[Request, Response], request: Request, budget: Budget) -> Response:
         response: Response = self._retrying(budget)(self._transport.call, route, request, budget)
         return response
+
+    def _open(
+        self, route: Route[Request, Response], request: Request, timeout: float | None
+    ) -> Stream[Response]:
+        budget = self._settings.budget(timeout)
+        stream: Stream[Response] = self._retrying(budget)(self._transport.open, route, request, budget)
+        return stream
 
     def _retrying(self, budget: Budget) -> tenacity.Retrying:
         return tenacity.Retrying(
@@ -391,16 +423,20 @@ class AsyncClient:
 
         Unlike there, the call starts with ``async with`` or the first message, and raises errors then.
         """
-        request = WatchSceneRequest(scene_id=scene_id)
+        return self._open(WATCH_SCENE, WatchSceneRequest(scene_id=scene_id), timeout)
 
-        async def start() -> OpenStream[WatchSceneResponse]:
-            budget = self._settings.budget(timeout)
-            opened: OpenStream[WatchSceneResponse] = await self._retrying(budget)(
-                self._open_transport().open, WATCH_SCENE, request, budget
-            )
-            return opened
+    async def list_scenes(self, timeout: float | None = None) -> list[SceneSummary]:  # noqa: ASYNC109
+        """See ``Client.list_scenes``."""
+        return list((await self._call(LIST_SCENES, ListScenesRequest(), timeout)).scenes)
 
-        return AsyncStream(start)
+    def watch_forecasts(
+        self, scene_id: str, timeout: float | None = None
+    ) -> AsyncStream[WatchForecastsResponse]:
+        """See ``Client.watch_forecasts``.
+
+        Unlike there, the call starts with ``async with`` or the first message, and raises errors then.
+        """
+        return self._open(WATCH_FORECASTS, WatchForecastsRequest(scene_id=scene_id), timeout)
 
     async def close(self) -> None:
         """See ``Client.close``."""
@@ -428,6 +464,18 @@ class AsyncClient:
         transport = self._open_transport()
         response: Response = await self._retrying(budget)(transport.call, route, request, budget)
         return response
+
+    def _open(
+        self, route: Route[Request, Response], request: Request, timeout: float | None
+    ) -> AsyncStream[Response]:
+        async def start() -> OpenStream[Response]:
+            budget = self._settings.budget(timeout)
+            opened: OpenStream[Response] = await self._retrying(budget)(
+                self._open_transport().open, route, request, budget
+            )
+            return opened
+
+        return AsyncStream(start)
 
     def _open_transport(self) -> AsyncTransport:
         if self._transport is None:

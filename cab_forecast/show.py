@@ -1,6 +1,7 @@
 """Forecasts and consistency as tables in the terminal."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from datetime import datetime
 
 import numpy as np
 from rich.console import Console
@@ -16,6 +17,7 @@ from cab.forecast.v1.consistency_service_pb2 import (
     WatchSceneResponse,
 )
 from cab.forecast.v1.prediction_service_pb2 import Agent, PredictRequest, PredictResponse
+from cab.forecast.v1.scene_service_pb2 import SceneSummary
 from cab_forecast.forecast import (
     Forecast,
     Status,
@@ -89,7 +91,7 @@ def print_instants(
     if not instants:
         console.print("[dim]no forecast has been observed yet[/]")
         return
-    table = _consistency_table(
+    table = _left_table(
         f"{title}: time in s, distances in m, C(range) in s", "agent", "time", "model", "forecasts"
     )
     for heading in _metric_headings():
@@ -110,7 +112,7 @@ def print_models(models: Sequence[ModelConsistency], console: Console | None = N
     if not models:
         console.print("[dim]no forecasts are settled yet[/]")
         return
-    table = _consistency_table("Settled forecasts: means; distances in m, C(range) in s", "model")
+    table = _left_table("Settled forecasts: means; distances in m, C(range) in s", "model")
     for heading in ("sets", *_metric_headings()):
         table.add_column(heading, justify="right", no_wrap=True)
     for model in models:
@@ -118,6 +120,29 @@ def print_models(models: Sequence[ModelConsistency], console: Console | None = N
         errors = {entry.age: entry.displacement_error for entry in model.errors}
         means = [model.dispersion_standard_deviation, *map(convergence.get, _RANGES), *map(errors.get, _AGES)]
         table.add_row(escape(model_name(model.model)), str(model.instants), *map(_mean, means))
+    console.print(table)
+
+
+def print_scenes(scenes: Sequence[SceneSummary], console: Console | None = None) -> None:
+    """Print the live scenes.
+
+    Args:
+        scenes: the scenes, in the order to print.
+        console: the console; None: standard output.
+    """
+    console = _wide(console)
+    if not scenes:
+        console.print("[dim]no scene was forecast lately[/]")
+        return
+    table = _left_table("Live scenes", "scene")
+    for heading in ("agents", "calls/s", "time, s"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for heading in ("last call", "model"):
+        table.add_column(heading, no_wrap=True)
+    for scene in scenes:
+        called = datetime.fromtimestamp(scene.updated_time).strftime("%H:%M:%S")
+        numbers = (f"{scene.agents}", f"{scene.rate_hz:.1f}", f"{scene.time:.2f}")
+        table.add_row(escape(scene.scene_id), *numbers, called, escape(model_name(scene.model)))
     console.print(table)
 
 
@@ -337,7 +362,7 @@ def _origin(response: PredictResponse) -> str:
     return " · ".join(parts)
 
 
-def _consistency_table(title: str, *columns: str) -> Table:
+def _left_table(title: str, *columns: str) -> Table:
     table = Table(title=title, title_justify="left", title_style="bold", box=None, padding=(0, 2, 0, 0))
     for column in columns:
         table.add_column(column, overflow="fold")

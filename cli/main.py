@@ -16,6 +16,7 @@ from cli import (
     predict,
     reload,
     replay,
+    scenes,
     serve,
     train,
 )
@@ -49,6 +50,7 @@ predict.register(app)
 maps.register(app)
 reload.register(app)
 replay.register(app)
+scenes.register(app)
 consistency.register(app)
 keys.register(app)
 convert.register(app)

@@ -26,7 +26,7 @@ from service.predict.torch_threads import forward_widths, set_helper_threads
 from service.recording.factory import make_recorder
 from service.scenes.fanout import FrameFanout
 from service.scenes.live import LiveScenes
-from service.scenes.service import SceneService
+from service.scenes.service import SceneService, make_shared_scenes
 from service.settings import Settings, split_shadow
 from service.telemetry.build import build_of
 from service.telemetry.metrics import Metrics
@@ -81,12 +81,24 @@ class DataPlane:
         )
         """Calls of the consistency service."""
         live = LiveScenes(settings.track_expiry)
-        fanout = FrameFanout(settings.max_frame_bytes, metrics)
-        self.scenes = SceneService(live, fanout, watchers, self._lifecycle)
+        self._frame_thread = ThreadPoolExecutor(
+            1, thread_name_prefix="frames", initializer=set_helper_threads
+        )
+        fanout = FrameFanout(settings.max_frame_bytes, metrics, self._frame_thread)
+        self._shared_scenes = make_shared_scenes(settings, live, fanout, store_metrics)
+        self.scenes = SceneService(live, fanout, self._shared_scenes, watchers, self._lifecycle)
         """Calls of the scene service."""
-        self._publisher = Publisher(live, fanout, self._references, metrics)
         self._rasters = RasterLibrary(
             settings, metrics, self._threads, SharedRasters.from_settings(settings, store_metrics)
+        )
+        self._publisher = Publisher(
+            live,
+            fanout,
+            self._shared_scenes,
+            self._references,
+            self._rasters,
+            metrics,
+            self._frame_thread,
         )
         self._pipeline = Pipeline(
             settings,
@@ -155,6 +167,8 @@ class DataPlane:
         self._reloader = Reloader(load, self._settings, self._batcher, self._metrics, self._take_over)
         self._batcher.start(self._lifecycle.fail)
         await asyncio.gather(self._reloader.start(), self._guard.check(self._store.ping))
+        if self._shared_scenes is not None:
+            self._shared_scenes.start()
         self._lifecycle.set_ready()
         if self._settings.reload_seconds is not None:
             self._following = asyncio.create_task(
@@ -237,6 +251,8 @@ class DataPlane:
         if self._pipeline.shadow is not None:
             await self._pipeline.shadow.close()
         await self._publisher.close()
+        if self._shared_scenes is not None:
+            await self._shared_scenes.close()
         await self._batcher.stop()
         if self._pipeline.recorder is not None:
             await asyncio.to_thread(self._pipeline.recorder.close, _RECORDER_SECONDS)
@@ -246,6 +262,7 @@ class DataPlane:
         await self._asking.close()
         await self._store.close()
         await self._rasters.close()
+        await asyncio.to_thread(self._frame_thread.shutdown, cancel_futures=True)
         await asyncio.to_thread(self._threads.shutdown, cancel_futures=True)
 
     async def list_models(

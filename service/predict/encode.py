@@ -10,7 +10,7 @@ import torch
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.arrays import Floats, Ints
 from model.metrics.offroad import off_road
-from model.mixture import TrajectoryMixture, merge_modes
+from model.mixture import TrajectoryMixture
 from model.scenes.scene import STEP_SECONDS, Raster
 from service.predict.catalog import reference
 from service.predict.plan import Group, Plan
@@ -57,7 +57,7 @@ def encode(plan: Plan, seed: int) -> pb.PredictResponse:
     for group in plan.groups:
         if group.outcome is not None and group.drafts:
             members = [forecasts[draft.index] for draft in group.drafts]
-            _fill(members, group.outcome.mixture, plan.options, seed)
+            _fill(members, group, group.outcome.mixture, plan.options, seed)
     return response
 
 
@@ -96,7 +96,11 @@ def count_off_road(raster: Raster | None, groups: Sequence[Group]) -> Counter[st
 
 
 def _fill(
-    forecasts: Sequence[pb.AgentForecast], mixture: TrajectoryMixture, options: Options, seed: int
+    forecasts: Sequence[pb.AgentForecast],
+    group: Group,
+    mixture: TrajectoryMixture,
+    options: Options,
+    seed: int,
 ) -> None:
     """Fill in the numbers of N agents' forecasts; at most M of the K modes each."""
     agents, modes = mixture.log_weights.shape
@@ -108,7 +112,7 @@ def _fill(
             seeds = [agent_seed(seed, forecast.agent_id) for forecast in forecasts]
             samples = mixture.sample(options.samples, seeds).numpy().reshape(agents, -1)
         if options.merge:
-            merged = merge_modes(mixture)
+            merged = group.merged()
             mixture, counts, mode_ids = merged.mixture, merged.counts.numpy(), merged.mode_ids.numpy()
             modes = mode_ids.shape[1]
     weights = softmax(mixture.log_weights.numpy().astype(np.float64))

@@ -10,7 +10,7 @@ import torch
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from model.arrays import Bools, Ints
 from model.forecaster import Context, Forecaster, Protocol
-from model.mixture import TrajectoryMixture
+from model.mixture import MergedModes, TrajectoryMixture, merge_modes
 from model.scenes.resample import MAX_AGE, MAX_GAP, MIN_DIFFERENCE_SPAN, resample
 from model.scenes.scene import AgentType, Raster, Scene
 from service.errors import BadFields, Fault
@@ -61,6 +61,19 @@ class Group:
     """In the order of the job's agents; once it has run, only those with finite forecasts."""
     outcome: Outcome | None = None
     """None until the job has run; its mixture is that of ``drafts``."""
+    _merged: MergedModes | None = field(default=None, repr=False)
+
+    def merged(self) -> MergedModes:
+        """Return the merged modes of the outcome, which are merged once.
+
+        Raises:
+            ValueError: the job has not run.
+        """
+        if self.outcome is None:
+            raise ValueError("the job has not run")
+        if self._merged is None:
+            self._merged = merge_modes(self.outcome.mixture)
+        return self._merged
 
     def set_outcome(self, outcome: Outcome) -> list[Draft]:
         """Store the outcome of the job.

@@ -5,50 +5,72 @@ thread makes the frame. Frames that are asked for faster than that are dropped.
 """
 
 import asyncio
+import functools
+from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING
 
 import structlog
 
 from cab.forecast.v1 import prediction_service_pb2 as predict_pb
 from cab.forecast.v1 import scene_service_pb2 as pb
 from cab.forecast.v1.digest import raster_digest
-from service.predict.frames import build_frame
+from service.predict.frames import build_frame, frame_bytes, frame_json, frame_message
 from service.predict.plan import Plan
-from service.predict.torch_threads import set_helper_threads
+from service.predict.rasters.library import RasterLibrary
 from service.scenes.fanout import FrameFanout, PublishedFrame, PublishedMap
 from service.scenes.live import LiveScenes
 from service.scenes.map_image import scene_map
 from service.scenes.shared_message import SharedMessage
 from service.telemetry.metrics import Metrics
+from service.tracking.messages import latest_documents
 from service.tracking.model_references import ModelReferences
 from service.tracking.store.base import Instants
-from service.tracking.tracker import latest_consistency
+
+if TYPE_CHECKING:
+    from service.scenes.shared import SharedScenes
 
 _log = structlog.get_logger(__name__)
 
 _MAX_CALLS = 16
 """Max number of calls whose frames are being made or wait for it."""
+_MAX_MAPS = 16
+"""Max number of maps that are kept for further frames, each of some 100 kB."""
 
 
 class Publisher:
     """Maker of frames. Used on one event loop; frames are made and encoded in a thread."""
 
     def __init__(
-        self, live: LiveScenes, fanout: FrameFanout, references: ModelReferences, metrics: Metrics
+        self,
+        live: LiveScenes,
+        fanout: FrameFanout,
+        shared: "SharedScenes | None",
+        references: ModelReferences,
+        rasters: RasterLibrary,
+        metrics: Metrics,
+        thread: ThreadPoolExecutor,
     ) -> None:
         """
         Args:
             live: is told of each call.
             fanout: knows which scenes are watched, and delivers their frames.
+            shared: does so for the watchers of other servers; None: there are none.
             references: references to models.
+            rasters: keep the maps that frames name.
             metrics: count the frames.
+            thread: the one thread that makes frames.
         """
         self._live = live
         self._fanout = fanout
+        self._shared = shared
         self._references = references
+        self._rasters = rasters
         self._metrics = metrics
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="frames", initializer=set_helper_threads)
+        self._thread = thread
         self._tasks: set[asyncio.Task[None]] = set()
+        self._maps: OrderedDict[bytes, PublishedMap] = OrderedDict()
+        """Maps that were shown last, by digest; used in the thread."""
 
     def answered(
         self,
@@ -81,11 +103,10 @@ class Publisher:
         self._offer(request, plan, None, instants)
 
     async def close(self) -> None:
-        """Drop what is not made yet, and release the thread."""
+        """Drop what is not made yet."""
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        await asyncio.to_thread(self._thread.shutdown, cancel_futures=True)
 
     def _offer(
         self,
@@ -94,7 +115,9 @@ class Publisher:
         response: predict_pb.PredictResponse | None,
         instants: Instants,
     ) -> None:
-        if not self._fanout.is_watched(plan.options.scene_id):
+        scene_id = plan.options.scene_id
+        elsewhere = self._shared is not None and self._shared.is_watched(scene_id)
+        if not elsewhere and not self._fanout.is_watched(scene_id):
             return
         if len(self._tasks) >= _MAX_CALLS:
             self._metrics.frames_dropped.labels("busy").inc()
@@ -113,16 +136,21 @@ class Publisher:
         scene_id = plan.options.scene_id
         try:
             # The thread takes one after the other, so that frames keep the order of the calls
-            event, shown = await asyncio.get_running_loop().run_in_executor(
+            frame = await asyncio.get_running_loop().run_in_executor(
                 self._thread, self._make, request, plan, response, instants
             )
         except Exception:
             _log.exception("no frame", scene_id=scene_id)
             return
-        message = SharedMessage(event, self._thread)
-        shadow = response is None
         self._metrics.frames.inc()
-        self._fanout.publish(scene_id, PublishedFrame(shadow, message, shown))
+        raster = None if plan.scene is None else plan.scene.raster
+        if frame.map is not None and raster is not None and not request.scene_raster.digest:
+            self._rasters.keep(frame.map.digest, request.scene_raster, raster)
+        self._fanout.publish(scene_id, frame)
+        if self._shared is None or not self._shared.is_watched(scene_id):
+            return
+        if not self._shared.publish(scene_id, frame):
+            self._metrics.frames_dropped.labels("redis").inc()
 
     def _make(
         self,
@@ -130,20 +158,29 @@ class Publisher:
         plan: Plan,
         response: predict_pb.PredictResponse | None,
         instants: Instants,
-    ) -> tuple[pb.WatchForecastsResponse, PublishedMap | None]:
-        """Return the event of a call, and the map that it saw. Runs in the thread."""
+    ) -> PublishedFrame:
+        """Return the frame of a call. Runs in the thread."""
         models = {
             draft.agent_id: draft.forecaster.info.full_name
             for draft in plan.drafts
             if draft.forecaster is not None
         }
-        consistency = latest_consistency(models, instants, self._references)
-        forecasts = () if response is None else response.forecasts
-        frame = build_frame(request, plan, forecasts, consistency, shadow=response is None)
         shown = self._map(request, plan)
-        if shown is not None:
-            frame.map_digest = shown.digest
-        return pb.WatchForecastsResponse(frame=frame), shown
+        document = build_frame(
+            request,
+            plan,
+            () if response is None else response.forecasts,
+            latest_documents(models, instants, self._references),
+            shadow=response is None,
+            map_digest=b"" if shown is None else shown.digest,
+        )
+        message = SharedMessage(
+            functools.partial(frame_message, document),
+            self._thread,
+            frame_bytes(document),
+            functools.partial(frame_json, document),
+        )
+        return PublishedFrame(response is None, message, shown)
 
     def _map(self, request: predict_pb.PredictRequest, plan: Plan) -> PublishedMap | None:
         """Return the map that a call saw, which is made once for as long as it is shown."""
@@ -151,8 +188,11 @@ class Publisher:
         if raster is None:
             return None
         digest = request.scene_raster.digest or raster_digest(request.scene_raster)
-        known = self._fanout.map_of(plan.options.scene_id, digest)
-        if known is not None:
-            return known
-        event = pb.WatchForecastsResponse(map=scene_map(raster, digest))
-        return PublishedMap(digest, SharedMessage(event, self._thread))
+        known = self._maps.pop(digest, None)
+        if known is None:
+            event = pb.WatchForecastsResponse(map=scene_map(raster, digest))
+            known = PublishedMap(digest, SharedMessage(event, self._thread))
+        self._maps[digest] = known
+        while len(self._maps) > _MAX_MAPS:
+            self._maps.popitem(last=False)
+        return known

@@ -3,6 +3,7 @@
 import asyncio
 from collections import deque
 from collections.abc import AsyncGenerator
+from concurrent.futures import Executor
 from dataclasses import dataclass
 
 from cab.forecast.v1 import scene_service_pb2 as pb
@@ -79,12 +80,16 @@ class _Scene:
 class FrameFanout:
     """Watchers by scene; a slow one loses the oldest frames and delays nobody. Used on one event loop."""
 
-    def __init__(self, max_bytes: int, metrics: Metrics) -> None:
+    def __init__(self, max_bytes: int, metrics: Metrics, threads: Executor) -> None:
         """
         Args:
             max_bytes: size of all frames that wait for slow watchers, at most; one frame may always wait.
             metrics: count the frames that watchers lose.
+            threads: executor that encodes frames.
         """
+        self.threads = threads
+        self.changed = asyncio.Event()
+        """Event that is set whenever a scene gets its first watcher or loses its last one."""
         self._max_bytes = max_bytes
         self._metrics = metrics
         self._scenes: dict[str, _Scene] = {}
@@ -126,7 +131,10 @@ class FrameFanout:
         that follows them.
         """
         watcher = _Watcher()
-        scene = self._scenes.setdefault(scene_id, _Scene())
+        if scene_id not in self._scenes:
+            self._scenes[scene_id] = _Scene()
+            self.changed.set()
+        scene = self._scenes[scene_id]
         scene.watchers.add(watcher)
         self._watchers += 1
         try:
@@ -147,3 +155,4 @@ class FrameFanout:
             scene.watchers.discard(watcher)
             if not scene.watchers:
                 del self._scenes[scene_id]
+                self.changed.set()

@@ -2,7 +2,7 @@
 
 import time as clock
 from collections import OrderedDict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 from cab.forecast.v1 import model_service_pb2 as models_pb
@@ -41,8 +41,8 @@ class LiveScenes:
         self._scenes: OrderedDict[str, _Scene] = OrderedDict()
         """Called longest ago first."""
 
-    def __contains__(self, scene_id: str) -> bool:
-        return scene_id in self._scenes
+    def __len__(self) -> int:
+        return len(self._scenes)
 
     def called(self, scene_id: str, time: float, agents: int, model: models_pb.ModelReference) -> None:
         """Note an answered call. Takes microseconds.
@@ -79,6 +79,28 @@ class LiveScenes:
             )
             for scene_id, scene in reversed(self._scenes.items())
         ]
+
+
+def merged(summaries: Iterable[pb.SceneSummary]) -> list[pb.SceneSummary]:
+    """Return one summary for each scene: that of its newest call, with the rates of all servers.
+
+    Args:
+        summaries: summaries of several servers, which do not change.
+
+    Returns:
+        At most ``MAX_SCENES``, the scene that was called last first.
+    """
+    by_scene: dict[str, list[pb.SceneSummary]] = {}
+    for one in summaries:
+        by_scene.setdefault(one.scene_id, []).append(one)
+    scenes = []
+    for several in by_scene.values():
+        newest = pb.SceneSummary()
+        newest.CopyFrom(max(several, key=lambda one: one.updated_time))
+        recent = newest.updated_time - _RATE_WINDOW
+        newest.rate_hz = sum(one.rate_hz for one in several if one.updated_time > recent)
+        scenes.append(newest)
+    return sorted(scenes, key=lambda one: -one.updated_time)[:MAX_SCENES]
 
 
 def _rate(calls: deque[float], now: float) -> float:

@@ -148,11 +148,12 @@ class Metrics:
         self.frames_dropped = Counter(
             "forecast_frames_dropped_total",
             "Frames that watchers of scenes did not get: a watcher read too slowly (watcher, counted for "
-            "each), or frames were asked for faster than they are made (busy).",
+            "each), frames were asked for faster than they are made (busy), or Redis was too slow to bring "
+            "them to other servers (redis).",
             ["reason"],
             registry=self.registry,
         )
-        for cause in ("watcher", "busy"):
+        for cause in ("watcher", "busy", "redis"):
             self.frames_dropped.labels(cause)
         self.keys = KeyMetrics(self.registry)
         self.broken_files = Gauge(

@@ -196,23 +196,6 @@ class Tracker:
             del self._publishing[scene_id]
 
 
-def latest_consistency(
-    requested: Mapping[str, str], instants: Instants, references: ModelReferences
-) -> dict[str, pb.InstantConsistency]:
-    """Return the consistency at each agent's newest observation, by agent id. Takes milliseconds.
-
-    Args:
-        requested: the model of each agent, ``name@version`` by agent id.
-        instants: what the exchange of the call returned.
-        references: references to models.
-    """
-    if not instants.models:
-        return {}
-    metrics = instant_metrics(instants.packed)
-    messages = instant_messages(metrics, instants.agent_ids, instants.models, references)
-    return _newest(requested, instants.models, messages)
-
-
 def _newest(
     requested: Mapping[str, str], models: Sequence[str], messages: Sequence[pb.InstantConsistency]
 ) -> dict[str, pb.InstantConsistency]:

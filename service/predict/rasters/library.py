@@ -85,6 +85,21 @@ class RasterLibrary:
             raise UnknownRaster(digest)
         return raster
 
+    def keep(self, digest: bytes, message: pb.SceneRaster, raster: Raster) -> None:
+        """Keep a raster that was sent without its digest, so that calls can name it.
+
+        Args:
+            digest: its digest.
+            message: the raster as it was sent.
+            raster: the decoded raster, whose layers nobody writes to any more.
+        """
+        if self._from_memory(digest) is not None:
+            return
+        raster.layers.flags.writeable = False
+        self._put(digest, raster)
+        if self._shared is not None:
+            self._shared.put(digest, message.SerializeToString())
+
     async def close(self) -> None:
         """Wait for what is being decoded, and release the connections."""
         await asyncio.gather(*self._decoding.values(), return_exceptions=True)
@@ -148,10 +163,13 @@ class RasterLibrary:
     async def _decode_and_keep(self, digest: bytes, message: pb.SceneRaster) -> Raster:
         raster = await self._in_thread(decode_raster, message, self._settings)
         raster.layers.flags.writeable = False
+        self._put(digest, raster)
+        return raster
+
+    def _put(self, digest: bytes, raster: Raster) -> None:
         dropped = self._cache.put(digest, KeptRaster(raster, self._next_touch()))
         self._metrics.rasters_dropped.inc(dropped)
         self._metrics.raster_bytes.set(self._cache.size)
-        return raster
 
     def _decoded(self, digest: bytes, task: asyncio.Task[Raster]) -> None:
         del self._decoding[digest]

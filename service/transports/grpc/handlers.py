@@ -25,6 +25,7 @@ from service.access.caller import Grant
 from service.errors import TooLarge
 from service.predict.dataplane import DataPlane
 from service.predict.request_reader import LARGE_BYTES, EncodedRequest, RequestLimits, read_protobuf
+from service.scenes.shared_message import to_protobuf
 from service.settings import Settings
 from service.telemetry.request_ids import HEADER, current_request_id
 from service.transports.calls import STREAMS, UNARY_METHODS, CallRecords, parse_message
@@ -140,10 +141,6 @@ def _handler(make: Any, handle: Callable[[Incoming, Context], Any]) -> "grpc.Rpc
     return handler
 
 
-def _to_protobuf(message: Message) -> bytes:
-    return message.SerializeToString()
-
-
 async def _send(context: Context, event: Event) -> None:
     """Send one message of a stream.
 
@@ -151,6 +148,6 @@ async def _send(context: Context, event: Event) -> None:
         CancelledError: the client disconnected; gRPC notices this in a write before it cancels the call.
     """
     try:
-        await context.write(await encoded(event, _to_protobuf))
+        await context.write(await encoded(event, to_protobuf))
     except aio.InternalError as error:
         raise asyncio.CancelledError from error

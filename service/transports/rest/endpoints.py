@@ -28,6 +28,7 @@ from service.predict.request_reader import (
     SceneRequest,
     read_protobuf,
 )
+from service.scenes.shared_message import SharedMessage
 from service.settings import Settings
 from service.transports.calls import STREAMS, UNARY_METHODS, CallRecorder, CallRecords, parse_message
 from service.transports.intake import Intake
@@ -345,8 +346,14 @@ async def _wait_for_disconnect(receive: Receive) -> None:
         pass
 
 
-def _to_event(message: Message) -> bytes:
-    return b"data: " + to_json(message) + b"\n\n"
+def _to_event(event: Event) -> bytes:
+    if not isinstance(event, SharedMessage):
+        text = to_json(event)
+    elif event.json is not None:
+        text = event.json()
+    else:
+        text = to_json(event.message)
+    return b"data: " + text + b"\n\n"
 
 
 def _message_response(message: Message, outgoing: Format) -> Response:

@@ -90,12 +90,17 @@ class Route(Generic[Request, Response]):
         Args:
             request: of a GET, a message of scalars; the fields that are set go into path and query.
         """
-        path = _PATH_PARAMETER.sub(lambda match: quote(getattr(request, match[1]), safe="@"), self.path)
+        path = _PATH_PARAMETER.sub(lambda match: _segment(getattr(request, match[1])), self.path)
         if self.verb == "POST":
             return path
         in_path = _PATH_PARAMETER.findall(self.path)
         fields = {field.name: value for field, value in request.ListFields() if field.name not in in_path}
         return f"{path}?{urlencode(fields, quote_via=quote)}" if fields else path
+
+
+def _segment(value: str) -> str:
+    """Return a value as a segment of a path; HTTP libraries would drop one that is "." or ".."."""
+    return quote(value, safe="@") if value.strip(".") else value.replace(".", "%2E")
 
 
 PREDICT: Route[PredictRequest, PredictResponse] = Route(

@@ -43,6 +43,15 @@ class SceneKeys:
         """Number of events published so far."""
         return f"{self._scene}:published"
 
+    @property
+    def frames(self) -> str:
+        """Stream of the frames for watchers."""
+        return f"{self._scene}:frames"
+
+    def map(self, digest: bytes) -> str:
+        """Map for watchers, by its digest."""
+        return f"{self._scene}:map:{digest.hex()}"
+
 
 class Script:
     """Lua script; it is loaded again if Redis has forgotten it.
