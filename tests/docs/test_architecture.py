@@ -36,6 +36,7 @@ def test_the_walks_are_short() -> None:
     assert list(WALKS) == [
         "One Predict call",
         "One track-memory call",
+        "One frame for watchers",
         "One training step",
         "One benchmark run",
     ]
