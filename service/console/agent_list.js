@@ -92,7 +92,7 @@ export class AgentList {
     const words = agent.status === "ok" ? "" : STATUS_WORDS[agent.status];
     setText(what, agent.warnings.length ? `${words ? `${words}, ` : ""}⚠ warning` : words);
     const pacing = speed(present(agent));
-    setText(pace, pacing === null ? "" : `${pacing.toFixed(1)} m/s`);
+    setText(pace, pacing === null ? "" : pacing.toFixed(1));
   }
 
   _arrange() {

@@ -1,7 +1,7 @@
 // What is known of the chosen agent: status, modes, error and dispersion over time, convergence, Shapley values.
 
 import { icon, STATUS_WORDS } from "./agent_list.js";
-import { LineChart, make, setText, short, showBars } from "./charts.js";
+import { LineChart, make, percent, setText, short, showBars } from "./charts.js";
 import { endPoint, heading, modelName, present, speed } from "./frames.js";
 import { KEPT } from "./rolling_store.js";
 
@@ -26,8 +26,8 @@ export class AgentPanel {
       make("h4", {}, "Convergence C(τ) ", make("span", { class: "unit" }, "s, right since")),
       this._convergence, this._convergenceNote, charts, this.explanation,
     );
-    this._error = new LineChart(charts, { title: "Displacement error of forecasts made", unit: "m", window: KEPT, end: "newest", gap: 1 });
-    this._dispersion = new LineChart(charts, { title: "Dispersion (standard deviation)", unit: "m", window: KEPT, end: "newest", gap: 1 });
+    this._error = new LineChart(charts, { title: "Displacement error of forecasts made", unit: "m", window: KEPT, end: "newest", gap: 2.5 });
+    this._dispersion = new LineChart(charts, { title: "Dispersion (standard deviation)", unit: "m", window: KEPT, end: "newest", gap: 2.5 });
     this._icon = "";
   }
 
@@ -66,8 +66,8 @@ export class AgentPanel {
     const facts = [
       ["Speed", pace === null ? "unknown" : `${pace.toFixed(1)} m/s`],
       ["Heading", angle === null ? "unknown" : `${Math.round((((angle * 180) / Math.PI) % 360 + 360) % 360)}°`],
-      ["History", `${agent.states.length} ${agent.states.length === 1 ? "frame" : "frames"}`],
       ["Position", now ? `${now.x.toFixed(1)}, ${now.y.toFixed(1)} m` : "unknown"],
+      ["History", `${agent.states.length} ${agent.states.length === 1 ? "frame" : "frames"}`],
       ["Model", modelName(agent.model ?? frame.model)],
     ];
     if (this._facts.children.length !== 2 * facts.length)
@@ -154,7 +154,7 @@ function shortName(model) {
 }
 
 function weigh(cell, mode) {
-  setText(cell, mode ? `${(mode.weight * 100).toFixed(0)} %` : "–");
+  setText(cell, mode ? percent(mode.weight) : "–");
   cell.style.setProperty("--share", mode ? mode.weight : 0);
 }
 

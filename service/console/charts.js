@@ -32,6 +32,11 @@ export function short(value) {
   return size >= 0.1 || size === 0 ? value.toFixed(2) : value.toPrecision(2);
 }
 
+/** Return a probability for people. */
+export function percent(probability) {
+  return probability > 0 && probability < 0.005 ? "<1 %" : `${Math.round(probability * 100)} %`;
+}
+
 /** Return the smallest of 1, 2, 5 · 10^n that is not less than a number. */
 export function niceCeiling(value) {
   if (!(value > 0)) return 1;

@@ -21,7 +21,7 @@ export class Explainer {
     this._note = make("p", { class: "nothing", role: "status" });
     this._bars = make("ul", { class: "bars" });
     this._neighbours = make("ul", { class: "bars" });
-    this._title = make("h4", {}, "Shapley values ", make("span", { class: "unit" }, "m nearer to the forecast end"));
+    this._title = make("h4", {}, "Shapley values ", make("span", { class: "unit" }, "m nearer the forecast"));
     this._byTitle = make("h4", {}, "Of each neighbour");
     place.append(this._title, this._button, this._note, this._bars, this._byTitle, this._neighbours);
     this._button.addEventListener("click", () => this.ask());
@@ -62,7 +62,7 @@ export class Explainer {
   async ask() {
     const [frame, agent] = [this._frame, this._agent];
     if (!this._known || !this._allowed || !frame || !agent?.modes.length) return;
-    this._clear("The server works on it …");
+    this._clear("The server works on it: some hundred forecasts, made while no call waits for the model …");
     try {
       const model = `${frame.model.name}@${frame.model.version}`;
       const { time, agents, scene_raster } = predictRequest(frame, { only: agent.id });

@@ -161,7 +161,7 @@ export class HealthPage {
       `${model.modes}`,
       [model.uses_map && "map", model.uses_neighbors && "neighbours"].filter(Boolean).join(", ") || "own history",
       model.benchmark.fde_ml_6s_m === undefined ? "–" : `${model.benchmark.fde_ml_6s_m.toFixed(2)} m`,
-      model.trained_on || "nothing",
+      model.trained_on.replace(/;.*/s, " …") || "nothing",
     ]);
     const cells = (tag, names, options = {}) => names.map((name) => make(tag, options, name));
     document.getElementById("health-models").replaceChildren(

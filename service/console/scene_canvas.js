@@ -7,6 +7,17 @@ import { barLength } from "./view.js";
 
 const REACH = 16; // pixels around an agent that count as a click on it
 
+/** Return the image of a map as it is shown: x to the right and y up, where its rows run along x, its columns along y. */
+async function upright(map, colours) {
+  const image = await createImageBitmap(recolour(fromBase64(map.image), layerColours(colours)));
+  const canvas = new OffscreenCanvas(image.height, image.width);
+  const ctx = canvas.getContext("2d");
+  ctx.setTransform(0, -1, 1, 0, 0, image.width);
+  ctx.drawImage(image, 0, 0);
+  image.close();
+  return canvas.transferToImageBitmap();
+}
+
 /** A pane with its two canvases. It draws what it is told, when it is told. */
 export class SceneCanvas {
   /**
@@ -46,7 +57,7 @@ export class SceneCanvas {
   async setMap(map, colours) {
     this._map = map;
     const version = ++this._mapVersion;
-    const bitmap = map ? await createImageBitmap(recolour(fromBase64(map.image), layerColours(colours))) : null;
+    const bitmap = map ? await upright(map, colours) : null;
     if (version !== this._mapVersion) return;
     this._bitmap?.close();
     this._bitmap = bitmap;
@@ -86,14 +97,14 @@ export class SceneCanvas {
     ctx.fillStyle = colours.ground;
     ctx.fillRect(0, 0, size.width, size.height);
     if (this._bitmap) {
-      // Rows of the image run along x, columns along y; a pixel shows the ground around its point.
-      const metres = view.scale / this._map.pixels_per_meter;
-      const [left, top] = view.toCanvas(this._map.origin_x, this._map.origin_y, size);
-      ctx.save();
-      ctx.transform(0, -metres, metres, 0, left, top);
-      ctx.imageSmoothingEnabled = metres < 4;
-      ctx.drawImage(this._bitmap, -0.5, -0.5);
-      ctx.restore();
+      const { origin_x, origin_y, pixels_per_meter } = this._map;
+      const pixel = view.scale / pixels_per_meter;
+      const { width, height } = this._bitmap;
+      // A pixel shows the ground around its point
+      const highest = origin_y + (height - 0.5) / pixels_per_meter;
+      const [left, top] = view.toCanvas(origin_x - 0.5 / pixels_per_meter, highest, size);
+      ctx.imageSmoothingEnabled = pixel < 4;
+      ctx.drawImage(this._bitmap, left, top, width * pixel, height * pixel);
     }
     this._drawBar(ctx, colours);
   }

@@ -37,6 +37,7 @@ export class ScenePage {
     this._extras = new Extras(() => this._wake());
     this._sampling = false;
     this._scheduled = false;
+    this._stale = false;
     this._following = false;
     this._mayPredict = true;
     /** For those who measure: ticks that came, were drawn and were lost, ms of drawing, times that are shown. */
@@ -168,7 +169,7 @@ export class ScenePage {
       listenToPane(canvas, {
         moved: (how) => {
           if (how !== "zoom") this._setFollowing(false);
-          this._wake();
+          this._wake(false);
         },
         choose: (left, top) => {
           const id = canvas.agentAt(this._shown, left, top);
@@ -179,7 +180,7 @@ export class ScenePage {
           if (id !== this._hovered) {
             this._hovered = id;
             canvas.pane.classList.toggle("over-agent", id !== "");
-            this._wake();
+            this._wake(false);
           }
         },
       });
@@ -263,8 +264,12 @@ export class ScenePage {
 
   // ---- drawing ----
 
-  /** Draw with the browser's next frame. */
-  _wake() {
+  /**
+   * Draw with the browser's next frame.
+   * @param {boolean} contents whether more than the view has changed.
+   */
+  _wake(contents = true) {
+    this._stale ||= contents;
     if (this._scheduled || !this._watch) return;
     this._scheduled = true;
     requestAnimationFrame(() => {
@@ -298,14 +303,17 @@ export class ScenePage {
       this._secondCanvas.draw(other, { ...options, samples: [] }, this._colours);
       this._caption($("pane-b"), other, this._extras.waiting);
     }
-    this._timeline.show(frame, this._colours);
-    this._list.show(frame, this._selected);
-    this._showAgent(chosen, frame, other);
+    if (this._stale) {
+      this._timeline.show(frame, this._colours);
+      this._list.show(frame, this._selected);
+      this._showAgent(chosen, frame, other);
+      this._sayQuiet();
+    }
+    this._stale = false;
     if (frame && frame !== this._drawn) this.counts.drawn += 1;
     this._drawn = frame;
     this.counts.time = frame?.time ?? null;
     this.counts.secondTime = other?.time ?? null;
-    this._sayQuiet();
   }
 
   _options(frame) {

@@ -2,6 +2,7 @@
 //
 // Nothing is told by colour alone: types have shapes, statuses have outlines, probabilities have widths.
 
+import { percent } from "./charts.js";
 import { ellipse, heading, present } from "./frames.js";
 
 const FULL = 2 * Math.PI;
@@ -148,7 +149,7 @@ class Painter {
 
   /** Write the rank of a mode at its end, as the panel numbers it. */
   rank({ mean, weight }, rank) {
-    const text = `${rank + 1} · ${Math.round(weight * 100)} %`;
+    const text = `${rank + 1} · ${percent(weight)}`;
     this.text(text, this.px(mean[mean.length - 2]) + 7, this.py(mean[mean.length - 1]) - 7, this.colours.ink);
   }
 

@@ -42,11 +42,8 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def server(models: Path, browser: Browser) -> Iterator[Server]:
-    """A server with a shadow model and traffic of 64 agents at 10 Hz."""
-    with (
-        serving(models, default_model=MODEL, shadow=f"{SECOND}@{VERSION}:1") as running,
-        traffic(f"http://{running.http}", AGENTS),
-    ):
+    """A server with traffic of 64 agents at 10 Hz."""
+    with serving(models, default_model=MODEL) as running, traffic(f"http://{running.http}", AGENTS):
         yield running
 
 
@@ -100,11 +97,21 @@ def test_it_survives_a_restart_of_the_server(browser: Browser, models: Path) -> 
         assert all("Failed to load resource" in fault or "ERR_" in fault for fault in tab.faults)
 
 
-@pytest.mark.parametrize(
-    ("choice", "caption"),
-    [(f"{SECOND}@{VERSION}", f"{SECOND} {VERSION} ·"), ("shadow", f"{SECOND} {VERSION} (shadow)")],
-)
-def test_two_models_forecast_the_same_tick(tab: Console, choice: str, caption: str) -> None:
+def test_a_second_model_is_asked_for_the_same_tick(tab: Console) -> None:
+    check_two_models(tab, f"{SECOND}@{VERSION}", f"{SECOND} {VERSION} ·")
+
+
+def test_the_shadow_is_shown_on_the_same_tick(browser: Browser, models: Path) -> None:
+    with (
+        serving(models, default_model=MODEL, shadow=f"{SECOND}@{VERSION}:1") as running,
+        traffic(f"http://{running.http}", 5, hertz=5.0),
+        scene(browser, running) as tab,
+    ):
+        check_two_models(tab, "shadow", f"{SECOND} {VERSION} (shadow)")
+
+
+def check_two_models(tab: Console, choice: str, caption: str) -> None:
+    """Compare with a second model, and check that both pictures are of one tick."""
     page = tab.page
     page.get_by_role("option", name="vehicle-00").click()
     page.select_option("#compare", choice)
