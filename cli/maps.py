@@ -25,7 +25,8 @@ def map_(
         ),
     ],
     center: Annotated[
-        str | None, typer.Option(metavar="X,Y", help="Middle of the cut, m; by default that of the map.")
+        str | None,
+        typer.Option(metavar="X,Y", help="Middle of the cut, m; by default a road near the map's middle."),
     ] = None,
     size: Annotated[float, typer.Option(help="Side of the cut, m.")] = 300.0,
     pixels_per_meter: Annotated[
@@ -41,11 +42,12 @@ def map_(
     map_format: Annotated[
         str | None,
         typer.Option(
-            "--format", help="nuscenes, argoverse2, lanelet2, opendrive or geojson; by default told."
+            "--format",
+            help="nuscenes, argoverse2, lanelet2, opendrive or geojson; by default the file tells.",
         ),
     ] = None,
     layer_property: Annotated[
-        str | None, typer.Option(help="GeoJSON: the property that says a feature's layer [layer].")
+        str | None, typer.Option(help="GeoJSON: the property that says a feature's layer; by default layer.")
     ] = None,
     layer: Annotated[
         list[str] | None,

@@ -9,9 +9,10 @@ import pytest
 import shapely
 
 from cab.forecast.v1.prediction_service_pb2 import SceneRaster
-from cab_forecast import raster_digest
+from cab_forecast import predict_request, raster_digest
 from cab_forecast.layers import decode_layers
 from cab_forecast.maps import LAYERS, MapCutter, MapError, OffMapError, VectorMap, read_map
+from cab_forecast.rasters import RasterDigests
 from model.scenes.raster import cut_patches
 from model.scenes.scene import Raster
 
@@ -142,6 +143,16 @@ class TestCutter:
             raster = cutter.around(float(x), 57.0)
             assert raster.origin_x <= x - 40
             assert raster.origin_x + (raster.rows - 1) / 3.0 >= x + 40
+
+    def test_clients_send_a_cut_once(self) -> None:
+        cutter, digests = MapCutter(road(), size=100.0, step=20.0), RasterDigests()
+        named = []
+        for x in (201.0, 204.0, 208.0, 215.0, 219.0):
+            request = predict_request(0.0, [], raster=cutter.around(x, 55.0))
+            sending = digests.prepare(request)
+            named.append(sending.named)
+            digests.answered(sending)
+        assert named == [False, True, True, False, True]
 
     def test_few_cuts_are_kept(self) -> None:
         cutter = MapCutter(road(), size=100.0, step=5.0)
