@@ -60,7 +60,7 @@ from cab_forecast.connection import (
     from_variables,
 )
 from cab_forecast.endpoints import DEFAULT_ENDPOINT
-from cab_forecast.errors import UnknownRaster
+from cab_forecast.errors import DeadlineExceeded, UnknownRaster
 from cab_forecast.rasters import RasterDigests
 from cab_forecast.streams import AsyncStream, OpenStream, Stream
 from cab_forecast.timing import RETRY, WAIT, Budget, stop_condition
@@ -307,7 +307,10 @@ class Client:
         return self._send(route, request, self._settings.budget(timeout))
 
     def _send(self, route: Route[Request, Response], request: Request, budget: Budget) -> Response:
-        response: Response = self._retrying(budget)(self._transport.call, route, request, budget)
+        try:
+            response: Response = self._retrying(budget)(self._transport.call, route, request, budget)
+        except DeadlineExceeded as error:
+            raise budget.late(error) from error
         return response
 
     def _open(
@@ -462,7 +465,10 @@ class AsyncClient:
 
     async def _send(self, route: Route[Request, Response], request: Request, budget: Budget) -> Response:
         transport = self._open_transport()
-        response: Response = await self._retrying(budget)(transport.call, route, request, budget)
+        try:
+            response: Response = await self._retrying(budget)(transport.call, route, request, budget)
+        except DeadlineExceeded as error:
+            raise budget.late(error) from error
         return response
 
     def _open(

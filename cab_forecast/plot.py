@@ -35,8 +35,10 @@ _MIN_SIDE = 5.0
 _MARGIN = 6.0
 """Free margin around the contents, m."""
 _MIN_VIEW = 40.0
+"""Size of the view at least, m."""
 _MAX_VIEW = 240.0
-"""Size of the view, m; agents farther away are left out, so that the others do not become tiny."""
+"""Size of the area whose agents and forecasts the view shows, m; others are left out, so that these do not
+become tiny."""
 _MAX_LABELS = 24
 ELLIPSE_SECONDS = (2.0, 4.0, 6.0)
 """Horizons at which positions are marked and ellipses drawn."""
@@ -261,14 +263,17 @@ def _pointed_box(center: _Floats, heading: float, length: float, width: float) -
 
 def _view(agents: list[Agent], views: dict[str, Forecast]) -> tuple[_Floats, _Floats]:
     """Return the lower left and upper right corner of the view: [2] each, m."""
-    points = [np.array([(state.x, state.y) for state in agent.states]) for agent in agents]
-    points += [_extent(view) for view in views.values() if len(view.weights)]
-    middle = np.median([track[-1] for track in points[: len(agents)]], axis=0)
+    now = np.array([(agent.states[-1].x, agent.states[-1].y) for agent in agents])
+    near = (np.abs(now - np.median(now, axis=0)) <= _MAX_VIEW / 2).all(axis=1)
+    if not near.any():  # all agents are far apart
+        near[:] = True
+    shown = [agent for agent, is_near in zip(agents, near.tolist(), strict=True) if is_near]
+    points = [np.array([(state.x, state.y) for state in agent.states]) for agent in shown]
+    # Whole forecasts: a fast vehicle's reaches far beyond the agents
+    forecast = [views[agent.id] for agent in shown if agent.id in views]
+    points += [_extent(view) for view in forecast if len(view.weights)]
     every = np.concatenate(points)
-    near = every[(np.abs(every - middle) <= _MAX_VIEW / 2).all(axis=1)]
-    if not len(near):  # all agents are far apart
-        near = every
-    low, high = near.min(axis=0) - _MARGIN, near.max(axis=0) + _MARGIN
+    low, high = every.min(axis=0) - _MARGIN, every.max(axis=0) + _MARGIN
     missing = np.maximum(_MIN_VIEW - (high - low), 0.0) / 2
     return low - missing, high + missing
 

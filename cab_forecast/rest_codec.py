@@ -17,7 +17,6 @@ from cab_forecast.endpoints import Endpoint
 from cab_forecast.errors import (
     TOO_LARGE,
     UNREACHABLE,
-    DeadlineExceeded,
     FieldViolation,
     ForecastError,
     InternalError,
@@ -120,7 +119,7 @@ class Codec:
     def connection_error(self, error: httpx.TransportError | TimeoutError, budget: Budget) -> ForecastError:
         """Return the exception for a call without an HTTP response."""
         if isinstance(error, (httpx.TimeoutException, TimeoutError)):
-            return DeadlineExceeded(f"no response from {self._endpoint.url} within {budget.timeout:g} s")
+            return budget.exceeded()
         cause = str(error) or type(error).__name__
         # A server that misses a certificate ends the connection instead of a handshake or a response
         broken_off = isinstance(error, (httpx.ReadError, httpx.RemoteProtocolError))

@@ -12,6 +12,8 @@ from cab_forecast.errors import DeadlineExceeded, ForecastError
 
 _MIN_BACKOFF = 0.05
 _MAX_BACKOFF = 2.0
+_AT_ONCE = 0.2
+"""Share of the timeout before its end from which on a missed deadline is the client's."""
 
 
 class Budget(Mapping[str, float]):
@@ -48,8 +50,20 @@ class Budget(Mapping[str, float]):
         return left
 
     def exceeded(self) -> DeadlineExceeded:
-        """Return the error for a call that took longer."""
+        """Return the error for a call that took longer, the same over both transports."""
         return DeadlineExceeded(f"no response within {self.timeout:g} s")
+
+    def late(self, error: DeadlineExceeded) -> DeadlineExceeded:
+        """Return the error for a call that missed a deadline, the same over both transports.
+
+        Whether the server or the client notices first is chance. Only a deadline of the server's own, long
+        before the client's, has the server's text.
+        """
+        if self._end - time.monotonic() > _AT_ONCE * self.timeout:
+            return error
+        late = self.exceeded()
+        late.reason, late.request_id = error.reason, error.request_id
+        return late
 
     def __getitem__(self, phase: str) -> float:
         return self.remaining()

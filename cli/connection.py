@@ -71,17 +71,19 @@ def with_connection(command: Callable[..., None]) -> Callable[..., None]:
 
 
 @contextmanager
-def connect(connection: Connection, timeout: float) -> Iterator["Client"]:
+def connect(connection: Connection, timeout: float, retries: int | None = None) -> Iterator["Client"]:
     """Open a client; turn its errors into one line on standard error.
 
     Args:
         connection: the server.
         timeout: seconds per call, retries included.
+        retries: max number of retries of a call; None: the client's default.
 
     Raises:
         typer.Exit: with code 1, when a call fails.
     """
     from cab_forecast.client import Client  # noqa: PLC0415
+    from cab_forecast.connection import DEFAULT_RETRIES  # noqa: PLC0415
     from cab_forecast.errors import ForecastError  # noqa: PLC0415
 
     try:
@@ -89,6 +91,7 @@ def connect(connection: Connection, timeout: float) -> Iterator["Client"]:
             connection.endpoint,
             connection.token,
             timeout,
+            DEFAULT_RETRIES if retries is None else retries,
             ca_file=connection.ca_file,
             certificate_file=connection.certificate_file,
             key_file=connection.key_file,

@@ -9,6 +9,7 @@ from cli import (
     benchmark,
     consistency,
     convert,
+    demo,
     doctor,
     evaluate,
     keys,
@@ -48,6 +49,7 @@ serve.register(app)
 doctor.register(app)
 predict.register(app)
 maps.register(app)
+demo.register(app)
 reload.register(app)
 replay.register(app)
 scenes.register(app)

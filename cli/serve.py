@@ -2,6 +2,7 @@
 
 import asyncio
 import gc
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -73,7 +74,10 @@ def serve(
     ] = None,
     log_json: Annotated[bool | None, typer.Option(help="Log JSON lines. [default: text]")] = None,
     demo: Annotated[
-        bool, typer.Option("--demo", help="Once ready, forecast the bundled crossing over gRPC and print it.")
+        bool,
+        typer.Option(
+            "--demo", help="Forecast simulated traffic at a junction, and print one forecast of it."
+        ),
     ] = False,
 ) -> None:
     """Serve forecasts over gRPC and REST until SIGTERM or SIGINT.
@@ -106,23 +110,25 @@ def _serve(settings: "Settings", demo: bool) -> None:
 
     logs.configure(settings.log_level, settings.log_json)
 
-    async def main() -> None:
-        server = Server(settings)
-        await server.run(lambda started: _when_ready(started, demo))
+    with ExitStack() as until_end:
 
-    try:
-        with asyncio.Runner(loop_factory=_loop_factory()) as runner:
-            runner.run(main())
-    except (StartError, ServeError) as error:
-        fail(str(error))
+        async def main() -> None:
+            server = Server(settings)
+            await server.run(lambda started: _when_ready(started, until_end if demo else None))
+
+        try:
+            with asyncio.Runner(loop_factory=_loop_factory()) as runner:
+                runner.run(main())
+        except (StartError, ServeError) as error:
+            fail(str(error))
 
 
-def _when_ready(server: "Server", demo: bool) -> None:
+def _when_ready(server: "Server", demo: ExitStack | None) -> None:
     # Everything allocated so far lives until the end; exempt it from garbage collection, which delays calls
     gc.collect()
     gc.freeze()
-    if demo:
-        _show_demo(server)
+    if demo is not None:
+        _show_demo(server, demo)
 
 
 def _loop_factory() -> "type[asyncio.AbstractEventLoop] | None":
@@ -134,22 +140,30 @@ def _loop_factory() -> "type[asyncio.AbstractEventLoop] | None":
     return uvloop.Loop
 
 
-def _show_demo(server: "Server") -> None:
-    """Forecast the bundled crossing through the public client and print it."""
+def _show_demo(server: "Server", until_end: ExitStack) -> None:
+    """Forecast the bundled scene through the public client and print it, then let it move.
+
+    Args:
+        server: the server, which is ready.
+        until_end: what ends with the server.
+    """
     from cab_forecast import Client, ForecastError  # noqa: PLC0415
     from cab_forecast.demo import demo_request  # noqa: PLC0415
     from cab_forecast.show import print_forecasts  # noqa: PLC0415
+    from cli.demo import running_demo  # noqa: PLC0415
 
     settings = server.settings
     if settings.tls_certificate is not None or settings.keys_file is not None:
         typer.secho("demo: not shown by a server with TLS or a file of keys", err=True)
         return
-    tokens = settings.api_tokens
+    token = settings.api_tokens[0].get_secret_value() if settings.api_tokens else None
+    until_end.enter_context(running_demo(server.grpc_address, token))
     request = demo_request()
     try:
-        with Client(server.grpc_address, token=tokens[0].get_secret_value() if tokens else None) as client:
+        with Client(server.grpc_address, token=token) as client:
             response = client.predict(request)
     except ForecastError as error:
         typer.secho(f"demo: {error}", fg=typer.colors.RED, err=True)
         return
     print_forecasts(response, request)
+    typer.echo(f"Traffic moves at a simulated junction: open http://{server.http_address}/ (Ctrl-C ends)")

@@ -1,6 +1,8 @@
 """``cab-forecast train``: one training run, resumable."""
 
 import os
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,6 +13,11 @@ from cli.failures import fail
 if TYPE_CHECKING:
     from model.training.run import Run
     from model.training.state import Progress
+
+_ESTIMATE_AFTER = 4.0
+"""s of steps after which the duration of the run is estimated."""
+_INTERRUPTED = 130
+"""Exit code of a program that Ctrl-C ended, as shells have it."""
 
 
 def register(app: typer.Typer) -> None:
@@ -109,26 +116,92 @@ def train(
 
 
 def _run(run: "Run") -> None:
-    """Train, with a progress bar within the epoch and a line after each epoch."""
+    """Train, with a progress bar within the epoch, an estimate, and a line after each epoch."""
     from rich.console import Console  # noqa: PLC0415
 
     from cli.display import batches_bar  # noqa: PLC0415
     from model.training.loop import SCORE  # noqa: PLC0415
 
     # Under torchrun, only the process of rank 0 prints
-    console = Console(quiet=os.environ.get("RANK", "0") != "0")
-    with batches_bar(console) as bar:
-        task = bar.add_task("starting", total=None)
+    console = Console(quiet=os.environ.get("RANK", "0") != "0", soft_wrap=True, highlight=False)
+    estimate = Estimate(run.config.epochs, console.print)
+    epoch_now = 0  # no step has been made yet
+    console.print(f"{run.config.method.value}: reading the data")
+    try:
+        with batches_bar(console) as bar:
+            task = bar.add_task("starting", total=None)
 
-        def tick(epoch: int, done: int, batches: int) -> None:
-            bar.update(task, description=f"epoch {epoch}", completed=done, total=batches)
+            def tick(epoch: int, done: int, batches: int) -> None:
+                nonlocal epoch_now
+                epoch_now = epoch
+                bar.update(task, description=f"epoch {epoch}", completed=done, total=batches)
+                estimate.step(epoch, done, batches)
 
-        def report(progress: "Progress", figures: dict[str, float]) -> None:
-            best = "best so far" if progress.best_epoch == progress.epoch else f"best {progress.best_epoch}"
+            def report(progress: "Progress", figures: dict[str, float]) -> None:
+                is_best = progress.best_epoch == progress.epoch
+                best = "best so far" if is_best else f"best {progress.best_epoch}"
+                console.print(
+                    f"epoch {progress.epoch}: loss {figures['loss']:.3f}, FDE@6s {figures[SCORE]:.2f} m, "
+                    f"{figures['seconds']:.0f} s ({best})"
+                )
+
+            folder = run.train(report, tick, console.print)
+    except KeyboardInterrupt:
+        if epoch_now:
             console.print(
-                f"epoch {progress.epoch}: loss {figures['loss']:.3f}, FDE@6s {figures[SCORE]:.2f} m, "
-                f"{figures['seconds']:.0f} s ({best})"
+                f"interrupted in epoch {epoch_now}: run the same command again to resume at its beginning"
             )
-
-        folder = run.train(report, tick, console.print)
+        else:
+            console.print("interrupted before the first step: run the same command again to start")
+        raise typer.Exit(_INTERRUPTED) from None
     console.print(f"checkpoint: {folder}")
+
+
+class Estimate:
+    """What the first steps tell of a run: that it goes on, and how long it takes."""
+
+    def __init__(
+        self, epochs: int, say: Callable[[str], None], clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        """
+        Args:
+            epochs: number of epochs of the whole run.
+            say: called with each text.
+            clock: the time, s.
+        """
+        self._epochs = epochs
+        self._say = say
+        self._clock = clock
+        self._first: tuple[float, int] | None = None
+        """Time after the first step of this process, and the step."""
+        self._told = False
+
+    def step(self, epoch: int, done: int, batches: int) -> None:
+        """Hear of a step.
+
+        Args:
+            epoch: number of the epoch, from 1 on.
+            done: number of steps done in it.
+            batches: number of its steps.
+        """
+        if self._told:
+            return
+        now = self._clock()
+        if self._first is None:
+            self._first = now, done
+            self._say(
+                f"first step of epoch {epoch} done, of {batches} steps in each of {self._epochs} epochs"
+            )
+            return
+        begun, first = self._first
+        if now - begun < _ESTIMATE_AFTER and done < batches:
+            return
+        from model.data.cache_builder import duration_text  # noqa: PLC0415
+
+        self._told = True
+        each = (now - begun) / max(done - first, 1)
+        left = each * ((self._epochs - epoch) * batches + batches - done)
+        self._say(
+            f"{each:.2g} s a step: {duration_text(each * batches)} an epoch and {duration_text(left)} "
+            "to the end, without the validation after each epoch"
+        )

@@ -194,6 +194,9 @@ class DeadlineExceeded(ServiceError):
     reason = "DEADLINE_EXCEEDED"
     title = "Deadline exceeded"
 
+    def __init__(self, detail: str = "the deadline passed before a forecast was made") -> None:
+        super().__init__(detail)
+
 
 class RequestTimeout(ServiceError):
     """Error of a call whose request did not arrive in time."""

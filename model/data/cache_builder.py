@@ -6,6 +6,7 @@ there is none for the same settings, of the current ``cache_layout.FORMAT_VERSIO
 
 import hashlib
 import shutil
+import time
 import uuid
 import zlib
 from collections.abc import Callable, Iterator
@@ -42,6 +43,9 @@ from model.networks.config import AnyNetworkConfig, NetworkConfig
 from model.scenes.raster import FAR, NEAR, cut_patches
 from model.scenes.scene import AgentType, Raster
 
+_FIRST_MESSAGE, _MESSAGES = 5.0, 15.0
+"""s until the first message on the progress, and between those that follow."""
+
 
 def open_cache(
     folder: Path,
@@ -64,7 +68,7 @@ def open_cache(
         protocol: protocol of the inputs.
         config: configuration of the network, which determines how neighbours are held.
         history_frames: F, frames of history, now included.
-        on_message: called with a text if the cache is built, with the reason.
+        on_message: called with a text if the cache is built: why, how far it is, and how long it takes.
         variants: V, noisy reports of each pair (agent frame only).
 
     Raises:
@@ -79,9 +83,64 @@ def open_cache(
     try:
         return Cache.open(place, key)
     except DataError as error:
-        on_message(f"building the cache of {split}: {error}")
-    build_cache(reader, split, protocol, config, history_frames, place, variants=variants)
-    return Cache.open(place, key)
+        why = f"cannot be used ({error})" if place.exists() else "does not exist yet"
+        on_message(f"The cache of {split} {why}. It is built now, once for all runs with these settings.")
+    told = BuildProgress(reader.scene_count(split), split, on_message)
+    build_cache(reader, split, protocol, config, history_frames, place, told, variants)
+    cache = Cache.open(place, key)
+    told.finish(len(cache) // (1 + variants))
+    return cache
+
+
+class BuildProgress:
+    """Messages on how far a cache is: after the first scenes, and then now and then."""
+
+    def __init__(
+        self,
+        scenes: int,
+        split: str,
+        on_message: Callable[[str], None],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """
+        Args:
+            scenes: number of the split's scenes.
+            split: name of the split.
+            on_message: called with each text.
+            clock: the time, s.
+        """
+        self._scenes = scenes
+        self._split = split
+        self._on_message = on_message
+        self._clock = clock
+        self._begun = clock()
+        self._next = self._begun + _FIRST_MESSAGE
+        self._done = 0
+
+    def __call__(self, record: SceneRecord) -> None:
+        """Count a scene."""
+        self._done += 1
+        now = self._clock()
+        if now < self._next or self._done >= self._scenes:
+            return
+        self._next = now + _MESSAGES
+        left = (now - self._begun) * (self._scenes - self._done) / self._done
+        self._on_message(
+            f"{self._split}: {self._done} of {self._scenes} scenes, about {duration_text(left)} left"
+        )
+
+    def finish(self, pairs: int) -> None:
+        """Say that the cache is complete, and how many pairs it has."""
+        spent = duration_text(self._clock() - self._begun)
+        self._on_message(f"{self._split}: cache of {pairs} pairs from {self._done} scenes built in {spent}")
+
+
+def duration_text(seconds: float) -> str:
+    """Return a duration for people, e.g. "40 s", "12 min" or "3.5 h"."""
+    if seconds < 99.5:
+        return f"{seconds:.0f} s"
+    minutes = seconds / 60
+    return f"{minutes:.0f} min" if minutes < 99.5 else f"{minutes / 60:.1f} h"
 
 
 def build_cache(

@@ -25,6 +25,10 @@ EGO = "ego"
 MARGIN = 50.0
 """m of map around the tracks of a scene; a patch reaches 34.3 m."""
 
+_ADVICE = (
+    "It needs numpy < 2, so give it an environment of its own, and leave the server's as it is: "
+    'python3 -m venv .venv-nuscenes && .venv-nuscenes/bin/pip install "cab-forecast[benchmark]"'
+)
 _VERSIONS = {
     "mini_train": "v1.0-mini",
     "mini_val": "v1.0-mini",
@@ -67,7 +71,7 @@ class NuscenesReader:
             dataroot: folder with ``v1.0-mini`` or ``v1.0-trainval``, and ``maps`` with the map expansion 1.3.
 
         Raises:
-            ImportError: nuscenes-devkit is not installed.
+            DataError: nuscenes-devkit is not installed.
         """
         try:
             self._nuscenes = import_module("nuscenes.nuscenes").NuScenes
@@ -76,8 +80,7 @@ class NuscenesReader:
             self._challenge = import_module("nuscenes.eval.prediction.splits").get_prediction_challenge_split
             self._official = import_module("nuscenes.utils.splits").create_splits_scenes
         except ImportError as error:
-            fault = "reading nuScenes needs nuscenes-devkit (pip install nuscenes-devkit==1.2.0)"
-            raise ImportError(f"{fault}: {error}") from error
+            raise DataError(f"reading nuScenes needs nuscenes-devkit: {error}. {_ADVICE}") from error
         self._dataroot = dataroot
         self._databases: dict[str, Any] = {}
         self._maps: dict[str, VectorMap] = {}
@@ -103,21 +106,31 @@ class NuscenesReader:
         Raises:
             DataError: there is no such split, or a file is missing or bad; names it.
         """
-        if split not in _VERSIONS:
-            raise DataError(f"there is no split {split!r}; there are {', '.join(_VERSIONS)}")
-        database = self._database(_VERSIONS[split])
+        database = self._database_of(split)
         with _naming(database.table_root):
             helper = self._helper(database)
+        for scene, listed in self._split(database, split):
+            record = self._record(database, helper, scene, listed)
+            if record.pairs:
+                yield record
+
+    def scene_count(self, split: str) -> int:
+        """Return the number of scenes of a split, see ``Reader``."""
+        return len(self._split(self._database_of(split), split))
+
+    def _split(self, database: Any, split: str) -> list[tuple[dict[str, Any], list[tuple[str, str]] | None]]:
+        """Return a split's scenes in order of their names, and their listed pairs; None: standing ones."""
         scenes = sorted(database.scene, key=lambda scene: str(scene["name"]))
         if split in _STANDING:
             names = {*self._official()[_STANDING[split]]} - _HELD_BACK
-            records = (self._record(database, helper, scene) for scene in scenes if scene["name"] in names)
-            yield from (record for record in records if record.pairs)
-            return
+            return [(scene, None) for scene in scenes if scene["name"] in names]
         listed = self._listed(database, split)
-        for scene in scenes:
-            if scene["token"] in listed:
-                yield self._record(database, helper, scene, listed[scene["token"]])
+        return [(scene, listed[scene["token"]]) for scene in scenes if scene["token"] in listed]
+
+    def _database_of(self, split: str) -> Any:
+        if split not in _VERSIONS:
+            raise DataError(f"there is no split {split!r}; there are {', '.join(_VERSIONS)}")
+        return self._database(_VERSIONS[split])
 
     def _database(self, version: str) -> Any:
         if version not in self._databases:

@@ -54,24 +54,30 @@ class NuscenesPredReader:
         """Splits of the prediction challenge, and train in two parts, by scenes."""
         return tuple(_FOLDERS)
 
+    def scene_count(self, split: str) -> int:
+        """Return the number of scenes of a split, see ``Reader``."""
+        return len(self._files(split))
+
     def scenes(self, split: str) -> Iterator[SceneRecord]:
         """Yield the scenes of a split that have pairs, in order of their names.
 
         Raises:
             DataError: there is no such split, or a file is missing or bad; names it.
         """
+        for file in self._files(split):
+            record = self._scene(file)
+            if record.pairs:
+                yield record
+
+    def _files(self, split: str) -> list[Path]:
+        """Return the label files of a split's scenes, in order of their names."""
         if split not in _FOLDERS:
             raise DataError(f"there is no split {split!r}; there are {', '.join(_FOLDERS)}")
         folder = self._folder / "label" / _FOLDERS[split]
         files = sorted(folder.glob("*.txt"))
         if not files:
             raise DataError(f"{folder}: there are no label files (*.txt)")
-        for file in files:
-            if split in _IN_FOLD and _IN_FOLD[split] is not _in_fold(file.stem):
-                continue
-            record = self._scene(file)
-            if record.pairs:
-                yield record
+        return [file for file in files if split not in _IN_FOLD or _IN_FOLD[split] is _in_fold(file.stem)]
 
     def _scene(self, file: Path) -> SceneRecord:
         tracks, pairs = _read_labels(file)

@@ -90,6 +90,14 @@ class Reader(Interface):
         """Names of the splits."""
         ...
 
+    def scene_count(self, split: str) -> int:
+        """Return the number of scenes of a split, or a little more where some turn out to have no pairs.
+
+        Raises:
+            DataError: there is no such split, or the data is missing.
+        """
+        ...
+
     def scenes(self, split: str) -> Iterator[SceneRecord]:
         """Yield the scenes of a split that have pairs, in order of their names.
 

@@ -72,15 +72,23 @@ class SyntheticReader:
         """Names of the splits, which share no scene."""
         return tuple(SCENES)
 
-    def scenes(self, split: str) -> Iterator[SceneRecord]:
-        """Return the scenes of a split, in order of their names.
+    def scene_count(self, split: str) -> int:
+        """Return the number of scenes of a split.
 
         Raises:
             DataError: there is no such split.
         """
         if split not in SCENES:
             raise DataError(f"there is no split {split!r}; there are {', '.join(SCENES)}")
-        return (self.scene(split, number) for number in range(SCENES[split]))
+        return SCENES[split]
+
+    def scenes(self, split: str) -> Iterator[SceneRecord]:
+        """Return the scenes of a split, in order of their names.
+
+        Raises:
+            DataError: there is no such split.
+        """
+        return (self.scene(split, number) for number in range(self.scene_count(split)))
 
     def scene(self, split: str, number: int) -> SceneRecord:
         """Return one scene.

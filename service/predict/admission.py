@@ -110,7 +110,7 @@ class Call:
         except TimeoutError:
             if not timeout.expired():
                 raise
-            raise DeadlineExceeded("the deadline passed before a forecast was made") from None
+            raise DeadlineExceeded from None
 
 
 class Backlog:
@@ -331,7 +331,7 @@ class Admission:
                 continue
             if call.deadline < now + (0.0 if call.is_trial else self.costs.work(call.agents)):
                 self._metrics.refused.labels("dropped").inc()
-                turn.given.set_exception(DeadlineExceeded("the deadline passed while the call was queued"))
+                turn.given.set_exception(DeadlineExceeded())
                 continue
             self._set_share(call, min(call.places, batch))
             turn.given.set_result(None)

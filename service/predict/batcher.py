@@ -392,7 +392,7 @@ class Batcher:
         batch, late, departure = self._queue.take_batch(now, self._max_batch)
         for entry in late:
             self._metrics.refused.labels("dropped").inc()
-            entry.done.set_exception(DeadlineExceeded("the deadline passed while the call was queued"))
+            entry.done.set_exception(DeadlineExceeded())
         if batch:
             self._metrics.batches.labels(departure.value).inc()
         for entry in batch:

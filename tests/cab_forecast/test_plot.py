@@ -10,7 +10,7 @@ from PIL import Image
 
 import cab_forecast.plot
 from cab.forecast.v1.prediction_service_pb2 import PredictRequest
-from cab_forecast import agent, demo_request, map_patch, predict_request
+from cab_forecast import agent, demo_request, forecasts, map_patch, predict_request
 from cab_forecast.plot import DOTS_PER_INCH, LONG_SIDE, plot
 from tests.cab_forecast.answers import answer
 
@@ -72,3 +72,24 @@ def test_without_matplotlib_there_is_a_hint(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setitem(sys.modules, "matplotlib.axes", None)
     with pytest.raises(ModuleNotFoundError, match=r'pip install "cab-forecast\[plot\]"'):
         importlib.reload(cab_forecast.plot)
+
+
+def test_a_long_forecast_is_shown_whole() -> None:
+    request = predict_request(0.0, [agent("fast", "vehicle", [-0.5, 0.0], [[-15.0, 0.0], [0.0, 0.0]])])
+    response = answer(request)
+    (forecast,) = response.forecasts
+    forecast.means[:] = [
+        value for _ in forecast.weights for x in np.linspace(0, 185, 12) for value in (x, 1.0)
+    ]
+    low, high = cab_forecast.plot._view(list(request.agents), forecasts(response))
+    assert low[0] < 0
+    assert high[0] > 185
+
+
+def test_agents_far_away_are_left_out_with_their_forecasts() -> None:
+    places = {"a": 0.0, "b": 20.0, "c": 900.0}
+    request = predict_request(
+        0.0, [agent(name, "vehicle", [-0.5, 0.0], [[x, 0.0], [x, 0.0]]) for name, x in places.items()]
+    )
+    _, high = cab_forecast.plot._view(list(request.agents), forecasts(answer(request)))
+    assert high[0] < 400

@@ -35,7 +35,7 @@ def server(script: Script, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def test_prints_a_table() -> None:
     result = run(app, ["predict", "demo"])
     assert result.exit_code == 0
-    assert "car-left-turn" in result.stdout
+    assert "vehicle-" in result.stdout
     assert "model fan@1.0.0" in result.stdout
 
 

@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from cli.main import app
+from cli.train import Estimate
 from model.checkpoint import load_checkpoint
 from model.data.sources import READERS
 from model.training.config import Method
@@ -114,3 +115,46 @@ def test_what_cannot_be_trained_is_said(
     assert wrong in said
     assert "Traceback" not in said
     assert not (tmp_path / "out/checkpoint").exists()
+
+
+def test_the_first_step_and_an_estimate_are_told(tmp_path: Path, settings: Path) -> None:
+    code, shown, said = train(tmp_path, "trajectron", "--config", str(settings))
+    assert code == 0, said
+    assert "trajectron: reading the data" in shown
+    assert "The cache of some does not exist yet" in shown
+    assert "first step of epoch 1 done" in shown
+
+
+def test_the_estimate_comes_after_some_steps() -> None:
+    said: list[str] = []
+    seconds = iter([10.0, 12.0, 14.5])
+    estimate = Estimate(3, said.append, clock=lambda: next(seconds))
+    for done in range(1, 6):
+        estimate.step(1, done, 100)
+    assert said == [
+        "first step of epoch 1 done, of 100 steps in each of 3 epochs",
+        "2.2 s a step: 4 min an epoch and 11 min to the end, without the validation after each epoch",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("place", "told"),
+    [
+        ("model.training.run.open_cache", "interrupted before the first step: run the same command again"),
+        ("model.training.loop.save_state", "interrupted in epoch 1: run the same command again to resume"),
+    ],
+)
+def test_ctrl_c_ends_with_a_plain_word(
+    tmp_path: Path, settings: Path, monkeypatch: pytest.MonkeyPatch, place: str, told: str
+) -> None:
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(place, interrupt)
+        code, shown, said = train(tmp_path, "trajectron", "--config", str(settings))
+    assert code == 130
+    assert told in shown
+    assert "Traceback" not in said
+    code, _, said = train(tmp_path, "trajectron", "--config", str(settings))
+    assert code == 0, said

@@ -36,6 +36,8 @@ The messages are those of the gRPC contract (`cab.forecast.v1`) as JSON by proto
 `application/x-protobuf`. Field names are read in snake_case and camelCase and written in snake_case.
 Errors are `application/problem+json` (RFC 9457), with a machine-readable `reason`."""
 
+_OPERATIONS = "Operations"
+"""Tag of what is not of the contract."""
 _BINARY = {"schema": {"type": "string", "format": "binary"}}
 
 _NOW = 1_700_000_000.0
@@ -74,12 +76,27 @@ def openapi_document(settings: Settings, *, closed: bool = False) -> dict[str, A
             "description": _DESCRIPTION,
             "license": {"name": "Apache-2.0", "identifier": "Apache-2.0"},
         },
+        "tags": _tags(),
         "paths": paths,
         "components": {"schemas": message_schemas(settings) | {"Problem": _problem_schema()}},
     }
     if closed:
         document["components"]["securitySchemes"] = {"bearer": {"type": "http", "scheme": "bearer"}}
     return document
+
+
+def _tag(service: str) -> str:
+    """Return the tag of a service's methods, e.g. "Prediction"."""
+    return service.rpartition(".")[2].removesuffix("Service")
+
+
+def _tags() -> list[Schema]:
+    """Return the tags in the order of the route table, with the comments of the services."""
+    services = dict.fromkeys(route.service for route in ROUTES)
+    described = [
+        {"name": _tag(service), "description": comments()[service.rpartition(".")[2]]} for service in services
+    ]
+    return [*described, {"name": _OPERATIONS, "description": "Probes and metrics, outside the contract."}]
 
 
 def _operation(route: Route[Any, Any], settings: Settings) -> Schema:
@@ -93,6 +110,7 @@ def _operation(route: Route[Any, Any], settings: Settings) -> Schema:
     )
     operation: Schema = {
         "operationId": route.method,
+        "tags": [_tag(route.service)],
         "summary": text.split(". ")[0].rstrip("."),
         "description": text,
         "responses": {
@@ -178,6 +196,7 @@ def _probe(name: str, description: str, *errors: type[ServiceError]) -> Schema:
     content = {"text/plain": {"schema": {"type": "string"}}}
     return {
         "operationId": name,
+        "tags": [_OPERATIONS],
         "summary": description.rstrip("."),
         "responses": {"200": {"description": "Success.", "content": content}, **_problems(errors)},
     }

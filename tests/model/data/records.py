@@ -104,6 +104,10 @@ class FixedReader:
         """One with the records and one without."""
         return ("some", "none")
 
+    def scene_count(self, split: str) -> int:
+        """Return the number of the records."""
+        return len(self._records) if split == "some" else 0
+
     def scenes(self, split: str) -> Iterator[SceneRecord]:
         """Return the records."""
         if split == "some":

@@ -1,6 +1,7 @@
 """Caches of pairs: what is in them, and that only whole and fitting ones are used."""
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,7 @@ import pytest
 
 from model.data import cache, cache_builder, synthetic
 from model.data.cache import Cache
-from model.data.cache_builder import build_cache, open_cache
+from model.data.cache_builder import BuildProgress, build_cache, duration_text, open_cache
 from model.data.cache_layout import FORMAT_VERSION, CacheKey
 from model.data.protocols import frame_scene
 from model.data.scenes import DataError, Pair, SceneRecord
@@ -253,13 +254,46 @@ def test_a_cache_is_built_once_for_each_setting(tmp_path: Path) -> None:
     messages: list[str] = []
     _open(tmp_path, messages)
     _open(tmp_path, messages)
-    assert len(messages) == 1
-    assert "building the cache of some" in messages[0]
-    assert "there is no such file; the cache has to be built" in messages[0]
+    begun, finished = messages
+    assert begun == (
+        "The cache of some does not exist yet. It is built now, once for all runs with these settings."
+    )
+    assert re.fullmatch(r"some: cache of \d+ pairs from \d+ scenes built in \d+ s", finished)
     assert _open(tmp_path, messages, history_frames=9).history.shape[1] == 9
-    assert len(messages) == 2
+    assert len(messages) == 4
     assert _open(tmp_path, messages).history.shape[1] == FRAMES
-    assert len(messages) == 2
+    assert len(messages) == 4
+
+
+def test_a_damaged_cache_is_built_again_and_the_reason_told(tmp_path: Path) -> None:
+    messages: list[str] = []
+    _open(tmp_path, messages)
+    (manifest,) = tmp_path.glob("*/manifest.json")
+    manifest.write_text("{")
+    messages.clear()
+    _open(tmp_path, messages)
+    assert re.match(r"The cache of some cannot be used \(.*manifest\.json: cannot be read: ", messages[0])
+
+
+def test_the_progress_tells_how_far_it_is_and_how_long_it_takes() -> None:
+    messages: list[str] = []
+    seconds = iter([0.0, 2.0, 6.0, 12.0, 21.5, 30.0, 31.0])
+    progress = BuildProgress(5, "train", messages.append, clock=lambda: next(seconds))
+    for _ in range(5):  # after 2, 6, 12, 21.5 and 30 s
+        progress(RECORDS[0])
+    progress.finish(70)
+    assert messages == [
+        "train: 2 of 5 scenes, about 9 s left",
+        "train: 4 of 5 scenes, about 5 s left",
+        "train: cache of 70 pairs from 5 scenes built in 31 s",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.4, "0 s"), (99, "99 s"), (100, "2 min"), (5900, "98 min"), (12600, "3.5 h")]
+)
+def test_durations_are_written_for_people(seconds: float, text: str) -> None:
+    assert duration_text(seconds) == text
 
 
 def test_a_cache_with_other_settings_in_its_place_is_rebuilt(tmp_path: Path) -> None:
@@ -270,8 +304,8 @@ def test_a_cache_with_other_settings_in_its_place_is_rebuilt(tmp_path: Path) -> 
     manifest["key"]["data"] = "elsewhere"
     (folder / "manifest.json").write_text(json.dumps(manifest))
     assert _open(tmp_path, messages).manifest.key == KEY
-    assert len(messages) == 2
-    assert "other settings: data is elsewhere, not made up" in messages[1]
+    assert len(messages) == 4
+    assert "other settings: data is elsewhere, not made up" in messages[2]
 
 
 def test_a_cache_of_another_format_version_is_rebuilt(
@@ -287,10 +321,10 @@ def test_a_cache_of_another_format_version_is_rebuilt(
     ):
         Cache.open(folder, KEY)
     assert _open(tmp_path, messages).manifest.format_version == FORMAT_VERSION + 1
-    assert len(messages) == 2
-    assert f"format version {FORMAT_VERSION}, not {FORMAT_VERSION + 1}" in messages[1]
+    assert len(messages) == 4
+    assert f"format version {FORMAT_VERSION}, not {FORMAT_VERSION + 1}" in messages[2]
     _open(tmp_path, messages)
-    assert len(messages) == 2
+    assert len(messages) == 4
 
 
 def test_made_up_scenes_of_another_version_are_other_data(monkeypatch: pytest.MonkeyPatch) -> None:

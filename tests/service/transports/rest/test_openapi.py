@@ -197,3 +197,18 @@ async def test_examples_work(default: str) -> None:
         for example in reset_examples().values():
             response = await client.post(f"{base}/v1/consistency/reset", json=example["value"])
             assert response.json()["agents"] > 0
+
+
+def test_every_operation_has_a_tag_that_is_described() -> None:
+    document = openapi_document(Settings())
+    described = {tag["name"]: tag["description"] for tag in document["tags"]}
+    assert all(described.values())
+    used = {
+        name: operation["tags"]
+        for operations in document["paths"].values()
+        for operation in operations.values()
+        for name in [operation["operationId"]]
+    }
+    assert {tag for tags in used.values() for tag in tags} == described.keys()
+    assert used["Predict"] == ["Prediction"]
+    assert used["livez"] == ["Operations"]

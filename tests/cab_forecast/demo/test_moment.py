@@ -1,4 +1,4 @@
-"""The demo scene: physically possible and deterministic."""
+"""The demo request: a moment of the simulated junction."""
 
 import math
 import subprocess
@@ -10,8 +10,7 @@ from google.protobuf import json_format
 
 from cab.forecast.v1.prediction_service_pb2 import Agent, PredictRequest
 from cab_forecast import demo_request
-from cab_forecast.demo.crossing import driveable
-from cab_forecast.demo.paths import Motion, Path, Segment
+from cab_forecast.forecast import type_name
 from cab_forecast.layers import decode_layers
 
 AGENTS = list(demo_request().agents)
@@ -24,10 +23,10 @@ def test_is_the_same_at_every_call() -> None:
     )
 
 
-def test_has_who_was_promised() -> None:
-    assert len(AGENTS) == 11
-    assert len({agent.id for agent in AGENTS}) == 11
-    assert {len(agent.states) for agent in AGENTS} == {21, 6}
+def test_has_all_kinds_of_road_users_and_one_that_was_just_seen() -> None:
+    assert {type_name(agent.type) for agent in AGENTS} == {"vehicle", "pedestrian", "cyclist"}
+    assert 10 <= len({agent.id for agent in AGENTS}) == len(AGENTS) <= 16
+    assert max(len(agent.states) for agent in AGENTS) == 21
 
 
 def test_can_be_moved_in_time() -> None:
@@ -39,7 +38,6 @@ def test_can_be_moved_in_time() -> None:
 def test_layers() -> None:
     raster = demo_request().scene_raster
     layers = decode_layers(raster.image, raster.rows, raster.columns)
-    assert layers.shape == (3, 360, 360)
     assert layers.any(axis=(1, 2)).all()
     assert (layers[1:] <= layers[0]).all()  # paint is on roads
 
@@ -52,10 +50,10 @@ def test_layers() -> None:
     assert at(0, 0) == [True, False, False]
     assert at(30, 0) == [True, True, False]
     assert at(30, 3.5) == [True, False, True]
-    assert at(30, -8) == [True, False, False]  # the lay-by
-    assert at(30, 8) == [False] * 3
-    assert at(12, 12) == [False] * 3
-    assert at(7.5, 7.5)[0]  # a rounded corner
+    assert at(38, -10) == [True, False, False]  # the lay-by
+    assert at(30, 10) == [False] * 3
+    assert at(14, 14) == [False] * 3
+    assert at(9.5, 9.5)[0]  # a rounded corner
 
 
 @by_agent
@@ -67,42 +65,14 @@ def test_times_ascend_to_now_and_all_is_finite(agent: Agent) -> None:
 
 
 @by_agent
-def test_everyone_is_inside_the_raster_and_on_the_road_but_walkers(agent: Agent) -> None:
-    xy = np.array([(state.x, state.y) for state in agent.states])
-    assert (np.abs(xy) < 60.0).all()
-    if not agent.id.startswith("walker"):
-        assert driveable(xy[:, 0], xy[:, 1]).all()
-
-
-@by_agent
 def test_headings_and_velocities_agree_with_the_motion(agent: Agent) -> None:
     xy = np.array([(state.x, state.y) for state in agent.states])
     headings = np.array([state.heading for state in agent.states])
     velocities = np.array([(state.velocity_x, state.velocity_y) for state in agent.states])
     moved = np.diff(xy, axis=0) / 0.1
-    np.testing.assert_allclose(
-        moved, (velocities[1:] + velocities[:-1]) / 2, atol=0.05
-    )  # a curve may begin between two observations
+    np.testing.assert_allclose(moved, (velocities[1:] + velocities[:-1]) / 2, atol=0.1)
     directions = np.stack([np.cos(headings), np.sin(headings)], axis=-1)
     np.testing.assert_allclose(velocities, np.hypot(*velocities.T)[:, None] * directions, atol=1e-9)
-
-
-def test_the_turn_is_one() -> None:
-    turning = next(agent for agent in AGENTS if agent.id == "car-left-turn")
-    assert turning.states[-1].heading - turning.states[0].heading > 0.4
-
-
-def test_paths_have_no_kinks() -> None:
-    path = Path(1.0, 2.0, 0.3, [Segment(2.0), Segment(3.0, 0.4), Segment(1.0, -0.2)])
-    poses = path.poses(np.arange(-1.0, 8.0, 0.01))
-    assert np.hypot(*np.diff(poses[:, :2], axis=0).T) == pytest.approx(0.01, rel=1e-4)
-    assert np.abs(np.diff(poses[:, 2])).max() <= 0.4 * 0.01 + 1e-12
-    assert poses[-1, 2] == pytest.approx(0.3 + 3.0 * 0.4 - 1.0 * 0.2)
-
-
-def test_no_one_drives_backwards() -> None:
-    with pytest.raises(ValueError, match="would have been negative"):
-        Motion(Path(0, 0, 0), 0.0, 1.0, 1.0).history(np.array([-2.0, 0.0]))
 
 
 def test_prints_itself() -> None:
