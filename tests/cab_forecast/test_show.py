@@ -21,7 +21,7 @@ from cab.forecast.v1.prediction_service_pb2 import (
     PredictRequest,
     PredictResponse,
 )
-from cab_forecast import demo_request
+from cab_forecast import agent, predict_request
 from cab_forecast.show import print_forecasts
 from tests.cab_forecast.answers import answer
 
@@ -35,8 +35,33 @@ def shown(response: PredictResponse, request: PredictRequest | None = None, widt
     return file.getvalue()
 
 
+def scene() -> PredictRequest:
+    """Return a request of eleven agents that go straight on."""
+    times = np.arange(-20, 1) / 10
+    starts = {
+        "car-straight": (7.0, -5.25, 10.0),
+        "truck-behind": (-21.0, -5.25, 8.5),
+        "car-parked": (34.0, -8.25, 0.0),
+    }
+    starts |= {f"walker-{number}": (3.0 * number, 12.0, 1.2) for number in range(8)}
+    return predict_request(
+        1.7e9,
+        [
+            agent(
+                name,
+                "pedestrian" if name.startswith("walker") else "vehicle",
+                1.7e9 + times,
+                np.stack([x + speed * times, np.full(21, y)], axis=-1),
+                headings=np.zeros(21),
+                velocities=np.tile([speed, 0.0], (21, 1)),
+            )
+            for name, (x, y, speed) in starts.items()
+        ],
+    )
+
+
 def test_says_everything() -> None:
-    request = demo_request()
+    request = scene()
     response = answer(request)
     response.forecasts[1].status = FORECAST_STATUS_FALLBACK
     response.forecasts[1].detail = "[this] type is not known"
@@ -61,7 +86,7 @@ def test_says_everything() -> None:
 
 
 def test_without_the_request_positions_are_those_of_the_ground_frame() -> None:
-    text = shown(answer(demo_request()))
+    text = shown(answer(scene()))
     assert "vehicle" not in text
     assert "straight on" not in text
     (straight,) = (line for line in text.splitlines() if line.startswith("car-straight"))
@@ -70,7 +95,7 @@ def test_without_the_request_positions_are_those_of_the_ground_frame() -> None:
 
 
 def test_an_agent_that_looks_nowhere_has_no_ahead() -> None:
-    request = demo_request()
+    request = scene()
     parked = next(agent for agent in request.agents if agent.id == "car-parked")
     for state in parked.states:
         state.ClearField("heading")
@@ -84,7 +109,7 @@ def test_an_agent_that_looks_nowhere_has_no_ahead() -> None:
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=6).filter(lambda drawn: sum(drawn) > 0.01), st.data())
 def test_percents_sum_to_a_hundred(drawn: list[float], data: st.DataObject) -> None:
     """The sum does not depend on the share of returned modes."""
-    request = demo_request()
+    request = scene()
     del request.agents[1:]
     response = answer(request)
     (forecast,) = response.forecasts
@@ -104,7 +129,7 @@ def test_percents_sum_to_a_hundred(drawn: list[float], data: st.DataObject) -> N
 
 @pytest.mark.parametrize(("width", "first"), [(120, True), (92, False), (20, False)])
 def test_a_narrow_terminal_gets_fewer_horizons(width: int, first: bool) -> None:
-    request = demo_request()
+    request = scene()
     text = shown(answer(request), request, width)
     assert ("in 1 s" in text) == first
     if width > 20:
@@ -113,7 +138,7 @@ def test_a_narrow_terminal_gets_fewer_horizons(width: int, first: bool) -> None:
 
 
 def test_a_short_horizon() -> None:
-    request = demo_request()
+    request = scene()
     request.options.horizon = 2.0
     text = shown(answer(request), request)
     assert "in 1 s" in text
@@ -122,7 +147,7 @@ def test_a_short_horizon() -> None:
 
 
 def test_what_became_of_the_memory() -> None:
-    response = answer(demo_request())
+    response = answer(scene())
     assert "memory" not in shown(response)
     response.tracking = TRACKING_STATUS_NEW
     response.timing.tracking = 0.0015
@@ -137,7 +162,7 @@ def test_what_became_of_the_memory() -> None:
 
 
 def test_warnings_of_the_input_are_shown_once() -> None:
-    response = answer(demo_request())
+    response = answer(scene())
     for forecast in response.forecasts[:2]:
         forecast.warnings.add(
             code=INPUT_WARNING_CODE_OFF_MAP, detail="90 % of the paths", field="scene_raster"

@@ -13,12 +13,13 @@ from unittest.mock import Mock
 
 import grpc
 import httpx
+import psutil
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from structlog.testing import capture_logs
 
 from cab.forecast.v1 import model_service_pb2 as models_pb
-from cab_forecast import AsyncClient, Client
+from cab_forecast import AsyncClient, Client, UnknownTrack
 from model.registry import Registry
 from service.lifecycle import Phase
 from service.server import ServeError, Server, StartError
@@ -445,16 +446,34 @@ def test_a_signal_drains(number: signal.Signals, tmp_path: Path) -> None:
         assert started.wait(15) == 0
 
 
-def test_demo_is_printed() -> None:
+def test_the_demo_is_printed_and_moves_until_the_server_ends() -> None:
     with process("--log-json", "--demo") as started:
         assert started.stdout is not None
-        _, address = ready(started)
-        lines = [next(started.stdout) for _ in range(3)]
+        http, address = ready(started)
+        lines: list[str] = []
+        while not lines or "Traffic moves" not in lines[-1]:
+            lines.append(next(started.stdout))
         assert any("vehicle" in line for line in lines)
+        assert f"open http://{http}/ " in lines[-1]
         with Client(address) as client:
-            assert client.list_models()
+            _wait_for_scene(client, "demo/junction")
+        (traffic,) = psutil.Process(started.pid).children()
         started.send_signal(signal.SIGTERM)
         assert started.wait(15) == 0
+        assert not traffic.is_running()
+
+
+def _wait_for_scene(client: Client, scene_id: str) -> None:
+    """Wait until a scene is remembered."""
+    deadline = time.monotonic() + 30
+    while True:
+        try:
+            client.scene_consistency(scene_id)
+        except UnknownTrack:
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        else:
+            return
 
 
 @pytest.mark.parametrize(
