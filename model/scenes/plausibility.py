@@ -51,6 +51,11 @@ JUMP_ACCELERATION = 15.0
 """m/s²; what it explains of the distance is allowed in addition."""
 OFF_SHARE = 0.25
 """Part of the paths of moving vehicles that is off the driveable area, at most."""
+IMAGE_SHARE = 0.1
+"""The same where a mirror image of the map fits better: where at most ``IMAGE_FIT`` of that is off it."""
+IMAGE_FIT = 0.2
+IMAGE_VEHICLES = 3
+"""Moving vehicles that it takes to tell by a mirror image; one or two that leave a car park can fit any."""
 PATH_AGES = (0.0, 0.5, 1.0, 1.5, 2.0)
 """s before the newest observation at which a path is compared with the map."""
 PATH_AHEAD = (0.5, 1.0)
@@ -377,8 +382,9 @@ def _off_map(
     if raster is not None and not own.all():
         points = path[~own]
         share = _share_off(raster.layers[0], (points - raster.origin) * raster.pixels_per_meter)
-        if share > OFF_SHARE:
-            detail = _off_detail(share, len(points)) + _map_hint(raster, points)
+        hint = _map_hint(raster, points, share) if share > IMAGE_SHARE else ""
+        if share > OFF_SHARE or (hint and len(points) >= IMAGE_VEHICLES):
+            detail = _off_detail(share, len(points)) + hint
             without = [row for row in range(len(types)) if row not in patches]
             found += [_finding(recent, row, -1, Contradiction.OFF_MAP, "", detail) for row in without]
     if own.any():
@@ -434,8 +440,14 @@ def _off_detail(share: float, vehicles: int) -> str:
     return f"{100 * share:.0f} % of the paths of {vehicles} moving vehicles are off the driveable area"
 
 
-def _map_hint(raster: Raster, points: Floats) -> str:
-    """Return which mirror image of the map the paths fit, as the end of a sentence."""
+def _map_hint(raster: Raster, points: Floats, share: float) -> str:
+    """Return which mirror image of the map the paths fit, as the end of a sentence; empty: none.
+
+    Args:
+        raster: the map.
+        points: [n, P, 2], m; the paths.
+        share: share of them off the map as it is.
+    """
     driveable = raster.layers[0]
     images = {
         "rows are reversed": driveable[::-1],
@@ -446,7 +458,7 @@ def _map_hint(raster: Raster, points: Floats) -> str:
     pixels = (points - raster.origin) * raster.pixels_per_meter
     shares = {text: _share_off(image, pixels) for text, image in images.items()}
     best = min(shares, key=shares.__getitem__)
-    return f"; they fit if its {best}" if shares[best] <= OFF_SHARE / 5 else ""
+    return f"; they fit if its {best}" if shares[best] <= IMAGE_FIT * share else ""
 
 
 def _mean_angle(angles: Floats, given: Bools) -> Floats:

@@ -74,6 +74,8 @@ class Outcome:
     """Seconds in the model, summed over its batches."""
     batch_agents: int
     """Number of agents in its (largest) batch."""
+    patches: float = 0.0
+    """Seconds of ``inference`` before the network began, in which map patches were cut."""
 
 
 @dataclass(eq=False)
@@ -264,11 +266,11 @@ class Batcher:
         return await self._run_alone(job, self._slots[-1], self._widths[-1], usual=False)
 
     async def _run_alone(self, job: Job, slot: _Slot, width: int, usual: bool = True) -> Outcome:
-        mixture, seconds = await asyncio.get_running_loop().run_in_executor(
+        mixture, seconds, patches = await asyncio.get_running_loop().run_in_executor(
             slot.thread, _forward, job, [job.inputs], job.steps, width, self._cutters
         )
         self._costs.measure(job.key, job.agents, seconds, usual=usual)
-        return Outcome(mixture, 0.0, seconds, job.agents)
+        return Outcome(mixture, 0.0, seconds, job.agents, patches)
 
     def forget(self, forecasters: Iterable[Forecaster]) -> None:
         """Forget how long the forwards of models take that are gone."""
@@ -352,7 +354,7 @@ class Batcher:
             slot.thread, _forward, job, parts, steps, width, self._cutters
         )
         try:
-            mixture, seconds = await asyncio.shield(running)
+            mixture, seconds, patches = await asyncio.shield(running)
         except asyncio.CancelledError:  # the batcher stops; a batch that has started is finished first
             await asyncio.wait([running])
             self._fail(batch, Unavailable("the server is stopping"))
@@ -367,7 +369,7 @@ class Batcher:
             self._fail(batch, Internal())
         else:
             self._measure(batch, started, seconds)
-            self._deliver(batch, mixture, started, seconds)
+            self._deliver(batch, mixture, started, seconds, patches)
         slot.batch = []
         self._tell_admission()
         self._wake.set()
@@ -400,7 +402,12 @@ class Batcher:
         return batch
 
     def _deliver(
-        self, batch: Sequence[_Entry], mixture: TrajectoryMixture, started: float, seconds: float
+        self,
+        batch: Sequence[_Entry],
+        mixture: TrajectoryMixture,
+        started: float,
+        seconds: float,
+        patches: float,
     ) -> None:
         agents = len(mixture)
         position = 0
@@ -409,7 +416,7 @@ class Batcher:
             position += entry.agents
             if not entry.done.done():
                 queue = started - entry.call.started
-                outcome = Outcome(_cut(part, entry.job.steps), queue, seconds, agents)
+                outcome = Outcome(_cut(part, entry.job.steps), queue, seconds, agents, patches)
                 entry.done.set_result(outcome)
 
     def _fail(self, entries: Iterable[_Entry], error: Internal | Unavailable) -> None:
@@ -428,7 +435,7 @@ class Batcher:
 
 def _forward(
     job: Job, parts: Sequence[Prepared], steps: int, width: int, cutters: Executor
-) -> tuple[TrajectoryMixture, float]:
+) -> tuple[TrajectoryMixture, float, float]:
     """Run one forward of the job's forecaster over the joined parts.
 
     Args:
@@ -439,7 +446,7 @@ def _forward(
         cutters: threads that cut map patches; with one thread the forward's own cuts them.
 
     Returns:
-        The mixture, and the seconds that it took.
+        The mixture, the seconds that it took, and those of them until patches were cut.
 
     Raises:
         RuntimeError: the mixture is not one of the expected agents, modes and steps.
@@ -450,9 +457,10 @@ def _forward(
     with torch.inference_mode():
         agents = sum(map(len, parts))
         features = complete(parts, cutters if width > 1 and agents >= _CUT_IN_THREADS else None)
+        patches = time.perf_counter() - started
         mixture = job.forecaster.forecast(features, job.agent_type, job.context, steps)
     require_shapes(job.forecaster.info, mixture, agents, steps)
-    return mixture, time.perf_counter() - started
+    return mixture, time.perf_counter() - started, patches
 
 
 def require_shapes(info: ModelInfo, mixture: TrajectoryMixture, agents: int, steps: int) -> None:
@@ -502,4 +510,5 @@ def combine(outcomes: Sequence[Outcome]) -> Outcome:
         min(outcome.queue for outcome in outcomes),
         sum(outcome.inference for outcome in outcomes),
         max(outcome.batch_agents for outcome in outcomes),
+        sum(outcome.patches for outcome in outcomes),
     )

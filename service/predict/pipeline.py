@@ -238,14 +238,18 @@ class Pipeline:
         for group, outcome in zip(groups, outcomes, strict=True):
             begun = call.started + outcome.queue
             past_span("queue", queued, begun)
-            past_span(
+            ended = begun + outcome.inference
+            forward = past_span(
                 "forward",
                 begun,
-                begun + outcome.inference,
+                ended,
                 model=group.job.forecaster.info.full_name,
                 agents=group.job.agents,
                 batch_agents=outcome.batch_agents,
             )
+            cut = begun + outcome.patches
+            past_span("patches", begun, cut, parent=forward)
+            past_span("network", cut, ended, parent=forward)
         return outcomes
 
     async def _encoded(self, plan: Plan, call: Call, work: "_Work") -> pb.PredictResponse:

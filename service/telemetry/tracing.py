@@ -15,7 +15,7 @@ import structlog
 if TYPE_CHECKING:
     from opentelemetry.sdk.trace import TracerProvider
     from opentelemetry.sdk.trace.export import SpanExporter
-    from opentelemetry.trace import Tracer
+    from opentelemetry.trace import Span, Tracer
 
 INSTALL = 'pip install "cab-forecast[tracing]"'
 """Command that installs what tracing needs."""
@@ -138,18 +138,25 @@ def span(name: str, **attributes: str | int) -> AbstractContextManager[object]:
     )
 
 
-def past_span(name: str, begun: float, ended: float, **attributes: str | int) -> None:
-    """Add a span of the current call that lies in the past, if calls are traced.
+def past_span(
+    name: str, begun: float, ended: float, parent: "Span | None" = None, **attributes: str | int
+) -> "Span | None":
+    """Add a span of the current call that lies in the past, if calls are traced, and return it.
 
     Args:
         name: name of the span.
         begun: its start, by ``time.perf_counter``.
         ended: its end, by ``time.perf_counter``.
+        parent: span of which it is a part; None: that of the call.
         attributes: its attributes.
     """
     tracer = _TRACER.get()
     if tracer is None:
-        return
+        return None
+    from opentelemetry.trace import set_span_in_context  # noqa: PLC0415
+
     offset = time.time_ns() - time.perf_counter_ns()
-    began = tracer.start_span(name, attributes=attributes, start_time=round(begun * 1e9) + offset)
-    began.end(round(ended * 1e9) + offset)
+    within = None if parent is None else set_span_in_context(parent)
+    made = tracer.start_span(name, within, attributes=attributes, start_time=round(begun * 1e9) + offset)
+    made.end(round(ended * 1e9) + offset)
+    return made

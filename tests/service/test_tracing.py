@@ -54,7 +54,8 @@ async def test_a_call_has_spans_for_its_stages(transport: str, exporter: "InMemo
             await TRANSPORTS[transport](server, request, sent)
     spans = by_name(exporter)
     stages = {"decode", "turn", "plan", "queue", "forward", "memory", "encode"}
-    assert set(spans) == {"Predict"} | stages
+    parts = {"patches", "network"}
+    assert set(spans) == {"Predict"} | stages | parts
     call = spans["Predict"]
     assert call.parent is not None
     assert (f"{call.context.trace_id:032x}", f"{call.parent.span_id:016x}") == (TRACE, PARENT)
@@ -65,14 +66,20 @@ async def test_a_call_has_spans_for_its_stages(transport: str, exporter: "InMemo
     assert attributes["forecast.code"] == "OK"
     assert call.start_time is not None
     assert call.end_time is not None
-    for name in stages:
+    for name in stages | parts:
         span = spans[name]
+        above = spans["forward"] if name in parts else call
         assert span.parent is not None
-        assert span.parent.span_id == call.context.span_id
+        assert span.parent.span_id == above.context.span_id
         assert span.start_time is not None
         assert span.end_time is not None
         # The clock that stages in the past are converted by is read once more, a little later
         assert call.start_time - 10**7 <= span.start_time <= span.end_time <= call.end_time + 10**7
+    # The parts make up the whole; clocks are converted for each span
+    ends = [spans[name].end_time for name in ("patches", "network", "forward")]
+    starts = [spans[name].start_time for name in ("network", "patches", "forward")]
+    for one, other in ((ends[0], starts[0]), (ends[1], ends[2]), (starts[1], starts[2])):
+        assert abs((one or 0) - (other or 0)) < 10**6
     forward = dict(spans["forward"].attributes or {})
     assert forward == {"model": "fake@1.0.0", "agents": 2, "batch_agents": 2}
     assert [entry["trace_id"] for entry in logs if entry["event"] == "call"] == [TRACE]

@@ -1,5 +1,6 @@
 """Contradictions in observations: what each check finds, and what it must not find."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -197,6 +198,22 @@ def test_a_mirrored_map(axes: tuple[int, ...], hint: str) -> None:
     found = find_contradictions(seen, [AgentType.VEHICLE] * 4, wrong)
     assert [finding.kind for finding in found] == [Contradiction.OFF_MAP] * 4
     assert found[0].detail.endswith(hint)
+
+
+def test_a_mirrored_map_that_has_most_vehicles_on_some_road() -> None:
+    seen = spread()
+    raster = road(seen)
+    turned = np.flip(raster.layers, (1, 2)).copy()
+    # All paths would be on a road of the wrong map, too, but for the first one near now
+    turned[0] |= raster.layers[0]
+    [[row, column]] = np.rint((seen.position[:1, -1] - raster.origin) * raster.pixels_per_meter).astype(int)
+    turned[0, row - 12 : row + 13, column - 12 : column + 13] = 0
+    wrong = replace(raster, layers=turned)
+    found = find_contradictions(seen, [AgentType.VEHICLE] * 4, wrong)
+    assert [finding.kind for finding in found] == [Contradiction.OFF_MAP] * 4
+    assert re.search(r"^(1\d|2[0-5]) % of the paths .* they fit if its ", found[0].detail)
+    few = [AgentType.VEHICLE] * 2 + [AgentType.PEDESTRIAN] * 2
+    assert not find_contradictions(seen, few, replace(raster, layers=turned))
 
 
 def test_a_map_elsewhere_and_one_agent_off_the_road() -> None:
