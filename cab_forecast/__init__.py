@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         UnknownTrack,
         Untrusted,
     )
+    from cab_forecast.explanations import as_explain_request, explain_options, explain_request
     from cab_forecast.forecast import Forecast, InputWarning, Status, Tracking, forecasts, tracking
     from cab_forecast.rasters import raster_digest
     from cab_forecast.requests import agent, map_patch, predict_request, scene_raster
@@ -59,7 +60,10 @@ __all__ = [
     "UnknownTrack",
     "Untrusted",
     "agent",
+    "as_explain_request",
     "demo_request",
+    "explain_options",
+    "explain_request",
     "forecasts",
     "map_patch",
     "predict_request",
@@ -73,6 +77,9 @@ _MODULES = {
     "AsyncStream": "streams",
     "Client": "client",
     "demo_request": "demo",
+    "as_explain_request": "explanations",
+    "explain_options": "explanations",
+    "explain_request": "explanations",
     "Forecast": "forecast",
     "InputWarning": "forecast",
     "Status": "forecast",

@@ -18,6 +18,7 @@ from cab.forecast.v1.consistency_service_pb2 import (
     WatchSceneRequest,
     WatchSceneResponse,
 )
+from cab.forecast.v1.explanation_service_pb2 import ExplainRequest, ExplainResponse
 from cab.forecast.v1.model_service_pb2 import (
     GetModelRequest,
     GetVersionRequest,
@@ -27,6 +28,7 @@ from cab.forecast.v1.model_service_pb2 import (
 )
 from cab.forecast.v1.prediction_service_pb2 import PredictRequest, PredictResponse
 from cab.forecast.v1.routes import (
+    EXPLAIN,
     GET_AGENT_CONSISTENCY,
     GET_MODEL,
     GET_SCENE_CONSISTENCY,
@@ -61,7 +63,7 @@ from cab_forecast.connection import (
 )
 from cab_forecast.endpoints import DEFAULT_ENDPOINT
 from cab_forecast.errors import DeadlineExceeded, UnknownRaster
-from cab_forecast.rasters import RasterDigests
+from cab_forecast.rasters import RasterDigests, SceneRequest
 from cab_forecast.streams import AsyncStream, OpenStream, Stream
 from cab_forecast.timing import RETRY, WAIT, Budget, stop_condition
 
@@ -145,19 +147,21 @@ class Client:
         Raises:
             ForecastError: the call failed; the subclass says why.
         """
-        budget = self._settings.budget(timeout)
-        if self._rasters is None:
-            return self._send(PREDICT, request, budget)
-        sending = self._rasters.prepare(request)
-        try:
-            response = self._send(PREDICT, sending.request, budget)
-        except UnknownRaster:
-            if not sending.named:
-                raise
-            sending = self._rasters.whole(request, sending)
-            response = self._send(PREDICT, sending.request, budget)
-        self._rasters.answered(sending)
-        return response
+        return self._send_scene(PREDICT, request, timeout)
+
+    def explain(self, request: ExplainRequest, timeout: float | None = None) -> ExplainResponse:
+        """Explain the forecasts of agents of a scene: what they owe to own state, map and neighbours.
+
+        Servers make explanations while no forecast waits for the model, so give them time.
+
+        Args:
+            request: the request, see ``cab_forecast.explain_request``.
+            timeout: seconds; None: the client's.
+
+        Raises:
+            ForecastError: the call failed; the subclass says why.
+        """
+        return self._send_scene(EXPLAIN, request, timeout)
 
     def list_models(self, timeout: float | None = None) -> list[Model]:
         """Return all loaded models, by name and version.
@@ -303,6 +307,24 @@ class Client:
     ) -> None:
         self.close()
 
+    def _send_scene(
+        self, route: Route[SceneRequest, Response], request: SceneRequest, timeout: float | None
+    ) -> Response:
+        """Send a request whose scene raster the server may have."""
+        budget = self._settings.budget(timeout)
+        if self._rasters is None:
+            return self._send(route, request, budget)
+        sending = self._rasters.prepare(request)
+        try:
+            response = self._send(route, sending.request, budget)
+        except UnknownRaster:
+            if not sending.named:
+                raise
+            sending = self._rasters.whole(request, sending)
+            response = self._send(route, sending.request, budget)
+        self._rasters.answered(sending)
+        return response
+
     def _call(self, route: Route[Request, Response], request: Request, timeout: float | None) -> Response:
         return self._send(route, request, self._settings.budget(timeout))
 
@@ -364,19 +386,11 @@ class AsyncClient:
 
     async def predict(self, request: PredictRequest, timeout: float | None = None) -> PredictResponse:  # noqa: ASYNC109 - it goes to the server, too
         """See ``Client.predict``."""
-        budget = self._settings.budget(timeout)
-        if self._rasters is None:
-            return await self._send(PREDICT, request, budget)
-        sending = self._rasters.prepare(request)
-        try:
-            response = await self._send(PREDICT, sending.request, budget)
-        except UnknownRaster:
-            if not sending.named:
-                raise
-            sending = self._rasters.whole(request, sending)
-            response = await self._send(PREDICT, sending.request, budget)
-        self._rasters.answered(sending)
-        return response
+        return await self._send_scene(PREDICT, request, timeout)
+
+    async def explain(self, request: ExplainRequest, timeout: float | None = None) -> ExplainResponse:  # noqa: ASYNC109
+        """See ``Client.explain``."""
+        return await self._send_scene(EXPLAIN, request, timeout)
 
     async def list_models(self, timeout: float | None = None) -> list[Model]:  # noqa: ASYNC109
         """See ``Client.list_models``."""
@@ -454,6 +468,27 @@ class AsyncClient:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         await self.close()
+
+    async def _send_scene(
+        self,
+        route: Route[SceneRequest, Response],
+        request: SceneRequest,
+        timeout: float | None,  # noqa: ASYNC109
+    ) -> Response:
+        """Send a request whose scene raster the server may have."""
+        budget = self._settings.budget(timeout)
+        if self._rasters is None:
+            return await self._send(route, request, budget)
+        sending = self._rasters.prepare(request)
+        try:
+            response = await self._send(route, sending.request, budget)
+        except UnknownRaster:
+            if not sending.named:
+                raise
+            sending = self._rasters.whole(request, sending)
+            response = await self._send(route, sending.request, budget)
+        self._rasters.answered(sending)
+        return response
 
     async def _call(
         self,

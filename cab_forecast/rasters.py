@@ -3,11 +3,16 @@
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 from cab.forecast.v1.digest import raster_digest
+from cab.forecast.v1.explanation_service_pb2 import ExplainRequest
 from cab.forecast.v1.prediction_service_pb2 import PredictRequest, SceneRaster
 
-__all__ = ["MIN_IMAGE_BYTES", "RasterDigests", "Sending", "raster_digest"]
+__all__ = ["MIN_IMAGE_BYTES", "RasterDigests", "SceneRequest", "Sending", "raster_digest"]
+
+SceneRequest = TypeVar("SceneRequest", PredictRequest, ExplainRequest)
+"""Requests with a scene raster."""
 
 MIN_IMAGE_BYTES = 4096
 """Encoded size from which rasters are named by their digest; smaller ones are always sent whole."""
@@ -34,10 +39,10 @@ class _Seen:
 
 
 @dataclass(frozen=True)
-class Sending:
+class Sending(Generic[SceneRequest]):
     """Decision on how the raster of a request is sent."""
 
-    request: PredictRequest
+    request: SceneRequest
     """The request to send."""
     digest: bytes = b""
     """Digest of its raster; empty: it is sent as it was given."""
@@ -55,7 +60,7 @@ class RasterDigests:
         """New rasters since one was sent again."""
         self._lock = threading.Lock()
 
-    def prepare(self, request: PredictRequest) -> Sending:
+    def prepare(self, request: SceneRequest) -> Sending[SceneRequest]:
         """Return how to send a request: with the digest of its raster alone if a server should have it."""
         raster = request.scene_raster
         if not request.HasField("scene_raster") or _image_bytes(raster) < MIN_IMAGE_BYTES:
@@ -75,7 +80,7 @@ class RasterDigests:
                 seen.pause = max(seen.pause - 1, 0)
         return Sending(_with_raster(request, digest, whole=not named), digest, named)
 
-    def whole(self, request: PredictRequest, sent: Sending) -> Sending:
+    def whole(self, request: SceneRequest, sent: Sending[SceneRequest]) -> Sending[SceneRequest]:
         """Return how to send a request again whose raster the server did not have."""
         with self._lock:
             seen = self._seen.setdefault(sent.digest, _Seen())
@@ -84,7 +89,7 @@ class RasterDigests:
             seen.pause = 2 ** (seen.unknown - 1) - 1
         return Sending(_with_raster(request, sent.digest, whole=True), sent.digest)
 
-    def answered(self, sent: Sending) -> None:
+    def answered(self, sent: Sending[SceneRequest]) -> None:
         """Note that a server has answered, and so has the raster."""
         if sent.digest:
             with self._lock:
@@ -104,9 +109,9 @@ def _image_bytes(raster: SceneRaster) -> int:
     return len(raster.image.packed_bits) + len(raster.image.png)
 
 
-def _with_raster(request: PredictRequest, digest: bytes, whole: bool) -> PredictRequest:
+def _with_raster(request: SceneRequest, digest: bytes, whole: bool) -> SceneRequest:
     """Return a copy of a request, with the raster and its digest, or with the digest alone."""
-    copy = PredictRequest()
+    copy = type(request)()
     for field, value in request.ListFields():
         if field.name == "scene_raster":
             continue

@@ -12,6 +12,7 @@ from cli import (
     demo,
     doctor,
     evaluate,
+    explain,
     keys,
     maps,
     predict,
@@ -48,6 +49,7 @@ def _options(
 serve.register(app)
 doctor.register(app)
 predict.register(app)
+explain.register(app)
 maps.register(app)
 demo.register(app)
 reload.register(app)

@@ -4,6 +4,7 @@ They lie in a small file beside the checkpoints (``model.data.explanation_donors
 the donor's frame: origin at its position now, x along its heading.
 """
 
+import io
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -200,7 +201,8 @@ def load_donors(folder: Path) -> Donors | None:
     """
     file = folder / FILE
     try:
-        with np.load(file, allow_pickle=False) as data:
+        # From memory: of a damaged archive numpy would leave the file open
+        with np.load(io.BytesIO(file.read_bytes()), allow_pickle=False) as data:
             if int(data["version"]) != _VERSION:
                 raise DonorsError(f"{file}: of a version that this release does not read")
             donors = Donors(

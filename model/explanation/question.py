@@ -269,7 +269,7 @@ class _Agent:
         states = self.scene.states
         self.position = states.position[target, -1]
         self.heading = _heading(states, target)
-        self.random = np.random.default_rng([settings.seed, _stable(self.position)])
+        self.random = np.random.default_rng(settings.seed)  # agents of a scene draw alike
         self.rows = _Rows()
         alone = np.array([target])
         self.neighbors = np.flatnonzero(forecaster.sees(self.scene, alone)[0])
@@ -419,8 +419,3 @@ def _stacked(one: AgentStates, others: AgentStates) -> AgentStates:
     return AgentStates(
         **{name: np.concatenate([getattr(one, name), getattr(others, name)]) for name in names}
     )
-
-
-def _stable(position: Floats) -> int:
-    """Return a number by which agents draw differently, the same on every machine."""
-    return int.from_bytes(np.round(position, 3).astype("<f8").tobytes(), "little")
