@@ -78,6 +78,16 @@ class ContextRun:
     """Time that these took; it is no part of the benchmark's."""
 
 
+@dataclass(frozen=True)
+class ExplanationRun:
+    """Settings of the explanations."""
+
+    pairs: int
+    """Number of pairs that were to be explained."""
+    baseline: str
+    """What stood for absent parts: "donors", where they fit, or "null_context"."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkModelResult(ModelResult):
     """Figures of one model, or of the physics oracle.
@@ -99,6 +109,9 @@ class BenchmarkModelResult(ModelResult):
     context: Mapping[str, Mapping[str, Estimate]] = field(default_factory=dict)
     """Effects of the context on the forecasts, by subset of the pairs and by name of the measure (see
     ``benchmark.context.measures``)."""
+    explanation: Mapping[str, Estimate] = field(default_factory=dict)
+    """Mean Shapley values of state, map and neighbors, m: how much nearer they bring the most likely end
+    point to where it is with everything present."""
     context_missing: int = 0
     """Missing forecasts among those with a changed context."""
 
@@ -140,6 +153,8 @@ class BenchmarkResults(Results):
     """Calls that the endpoint refused, in words."""
     context: ContextRun | None = None
     """None: the use of the context was not measured."""
+    explanation: ExplanationRun | None = None
+    """None: no forecasts were explained."""
 
     def statement(self) -> str:
         """Return what the figures are computed on, in words; every table carries it."""
@@ -219,6 +234,8 @@ def _with_nan(document: Any) -> Any:
         model["metrics"] = _known(model.get("metrics", {}))
         for measures in model.get("context", {}).values():
             measures.update({name: _known(one) for name, one in measures.items()})
+        explanation = model.get("explanation", {})
+        explanation.update({part: _known(one) for part, one in explanation.items()})
     return document
 
 

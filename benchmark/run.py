@@ -15,6 +15,7 @@ from benchmark.archive import Archive
 from benchmark.context import ContextBenchmark, ContextSettings
 from benchmark.errors import BenchmarkError
 from benchmark.evaluate import Evaluated, evaluate
+from benchmark.explanations import ExplanationBenchmark, ExplanationSettings
 from benchmark.hard_cases import HardCase, hard_case, shown_cases
 from benchmark.in_process import replay_in_process
 from benchmark.models import describe, key, select, unfit
@@ -102,6 +103,17 @@ class Benchmark:
     """Number of pairs, from the first; None: all."""
     context: ContextSettings | None = None
     """Settings of the measurement of the use of the context; None: it is not measured."""
+    explain: ExplanationSettings | None = None
+    """Settings of explanations, which an endpoint makes; None: there are none."""
+
+    @cached_property
+    def explanations(self) -> ExplanationBenchmark | None:
+        """Explanations of some pairs; None: not asked for."""
+        if self.explain is None:
+            return None
+        return ExplanationBenchmark(
+            self.folder, self.scenes, self.protocol, self.sampling.seed, self._properties(), self.explain
+        )
 
     @cached_property
     def context_benchmark(self) -> ContextBenchmark | None:
@@ -324,6 +336,8 @@ def run_benchmark(
         with progress.task("evaluating changed contexts", total, "forecasts") as tick:
             context = benchmark.context_benchmark.evaluate(list(models), evaluated, tick)
         results, evaluated = context.add_to(results, evaluated)
+    if benchmark.explanations is not None:
+        results = benchmark.explanations.add_to(results)
     out.mkdir(parents=True, exist_ok=True)
     results.write(out)
     evaluated.instances.write(out)
@@ -371,6 +385,11 @@ async def _replay(
                     client, models, endpoint.address, endpoint.concurrency, endpoint.timeout, tick
                 )
             _note_rate(replayed, progress, " with a changed context")
+        explanations = benchmark.explanations
+        if explanations is not None:
+            total = len(explanations.pairs) * len(models)
+            with progress.task("requesting explanations", total, "explanations") as tick:
+                await explanations.replay(client, models, endpoint.timeout, tick)
     return models
 
 

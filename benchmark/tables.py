@@ -3,6 +3,7 @@
 import math
 
 from benchmark.results import BenchmarkResults, Estimate, Latency
+from cab_forecast.explanations import PARTS
 from model.evaluation.published import PUBLISHED, PUBLISHED_CONSISTENCY, PUBLISHED_HARD_CASES
 from model.evaluation.tables import (
     DISPLACEMENT,
@@ -76,6 +77,7 @@ def _all(results: BenchmarkResults) -> list[Table | str]:
         paper_table(results, 3, HARD_CASES, PUBLISHED_HARD_CASES),
         _statuses(results),
         _context(results),
+        _explanations(results),
     ]
 
 
@@ -195,6 +197,33 @@ def _context(results: BenchmarkResults) -> Table | str:
         "part of the benchmark's time."
     )
     return Table(title, note, ("model", "pairs of", "pairs", *CONTEXT), rows)
+
+
+def _explanations(results: BenchmarkResults) -> Table | str:
+    title = "10. What the forecasts owe to state, map and neighbours"
+    if results.explanation is None:
+        return f"{title}: left out: they were not explained (--explain)"
+    rows = tuple(
+        (
+            model.label(results.protocol),
+            str(max(one.pairs for one in model.explanation.values())),
+            *(_estimate(part, model.explanation.get(part)) for part in PARTS),
+        )
+        for model in results.models
+        if model.explanation
+    )
+    if not rows:
+        return f"{title}: left out: no model has explanations"
+    absent = (
+        "drawn from donors where they fit" if results.explanation.baseline == "donors" else "the null context"
+    )
+    note = (
+        f"{results.statement()}. Mean Shapley values, m, with 95 % intervals by bootstrap over scenes: how "
+        "much nearer own state, map and neighbours bring the most likely end point at 6 s to where it is "
+        f"with everything present. What is absent is {absent}. {results.explanation.pairs} pairs drawn at "
+        "random. They say what forecasts follow, not whether they are right."
+    )
+    return Table(title, note, ("model", "pairs", *PARTS), rows)
 
 
 def _estimate(name: str, one: Estimate | None) -> str:

@@ -76,6 +76,10 @@ def benchmark(
             exists=True, file_okay=False, help="With --context: folder of a run with that model's responses."
         ),
     ] = None,
+    explain: Annotated[
+        int | None,
+        typer.Option(min=1, metavar="PAIRS", help="Also explain so many pairs by Shapley values."),
+    ] = None,
     limit: Annotated[int | None, typer.Option(min=1, help="Evaluate the first LIMIT pairs only.")] = None,
     seed: Annotated[int, typer.Option(min=0, max=2000, help="Seed of all random draws.")] = 0,
     concurrency: Annotated[int, typer.Option(min=1, help="Concurrent requests.")] = 16,
@@ -97,6 +101,7 @@ def benchmark(
         fail("--data and --out are needed (--data and --from, to evaluate saved responses)")
     from benchmark import Benchmark, BenchmarkError, run_benchmark
     from benchmark.context import ContextSettings
+    from benchmark.explanations import ExplanationSettings
     from model.data.scenes import DataError
     from model.data.sources import READERS, parse_data, parse_protocol
     from model.metrics.density import DRAWS
@@ -118,6 +123,7 @@ def benchmark(
                 consistency,
                 limit,
                 ContextSettings(donors, no_context_model, no_context_answers) if measure_context else None,
+                None if explain is None else ExplanationSettings(explain),
             ),
             None if saved else _endpoint(connection, concurrency, timeout),
             folder,

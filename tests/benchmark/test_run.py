@@ -15,6 +15,7 @@ from benchmark.archive import Archive
 from benchmark.context import ContextSettings
 from benchmark.errors import BenchmarkError
 from benchmark.evaluate import Evaluated
+from benchmark.explanations import FILE, ExplanationSettings
 from benchmark.models import BASELINES, select
 from benchmark.replay import Replayed
 from benchmark.results import BenchmarkResults
@@ -23,6 +24,7 @@ from benchmark.tables import markdown
 from cab.forecast.v1.model_service_pb2 import Model
 from cab.forecast.v1.prediction_service_pb2 import FORECAST_STATUS_FALLBACK
 from cab_forecast import AsyncClient
+from cab_forecast.explanations import PARTS
 from model.evaluation import selection
 from model.evaluation.run import Evaluation
 from model.forecaster import Forecaster, Protocol
@@ -342,3 +344,34 @@ def test_saved_answers_of_this_process_are_not_made_again(tmp_path: Path, models
     assert first.results == second.results == third.results
     with pytest.raises(BenchmarkError, match="this process has no model 'cab'; it has kalman"):
         run_benchmark(made(tmp_path / "run"), kalman, tmp_path / "run", names=["cab"])
+
+
+def test_explanations_of_some_pairs(tmp_path: Path, server: Server) -> None:
+    address = Endpoint(f"grpc://{server.grpc_address}", concurrency=4, timeout=30)
+    whole = replace(
+        made(tmp_path, limit=40),
+        sampling=Sampling(0, 0),
+        consistency=False,
+        explain=ExplanationSettings(pairs=6, baseline="null_context"),
+    )
+    names = ["cab", "kalman"]
+    results = run_benchmark(whole, address, tmp_path, names=names).results
+    by_model = {model.key: model.explanation for model in results.models}
+    cab, kalman = by_model["cab@1.0.0"], by_model["kalman@1.0.0"]
+    assert {part: one.pairs for part, one in cab.items()} == dict.fromkeys(PARTS, 6)
+    assert cab["map"].value or cab["neighbors"].value
+    assert kalman["state"].value > 0
+    assert (kalman["map"].value, kalman["neighbors"].value) == (0, 0)
+    assert "10. What the forecasts owe to state" in markdown(results)
+    assert BenchmarkResults.read(tmp_path) == results
+    # A run that was stopped goes on; what was not written to its end is asked again
+    file = tmp_path / FILE
+    lines = file.read_text().splitlines(keepends=True)
+    assert len(lines) == 1 + 2 * 6
+    file.write_text("".join(lines[:5]) + lines[5][:30])
+    again = run_benchmark(whole, address, tmp_path, names=names).results
+    assert {model.key: model.explanation for model in again.models} == by_model
+    assert len(file.read_text().splitlines()) == 1 + 2 * 6
+    other = replace(whole, explain=ExplanationSettings(pairs=5, baseline="null_context"))
+    with pytest.raises(BenchmarkError, match="another run"):
+        run_benchmark(other, address, tmp_path, names=names)

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from cab.forecast.v1 import consistency_service_pb2 as consistency_pb
 from cab.forecast.v1 import consistency_service_pb2_grpc as consistency_grpc
+from cab.forecast.v1 import explanation_service_pb2 as explanation_pb
 from cab.forecast.v1 import model_service_pb2 as models_pb
 from cab.forecast.v1 import model_service_pb2_grpc as models_grpc
 from cab.forecast.v1 import prediction_service_pb2 as pb
@@ -128,6 +129,20 @@ def test_noise_for_a_message(http: httpx.Client, body: bytes) -> None:
     assert answer.status_code < httpx.codes.INTERNAL_SERVER_ERROR, answer.text
     if answer.status_code == httpx.codes.OK:
         check(pb.PredictRequest.FromString(body), pb.PredictResponse.FromString(answer.content))
+
+
+@FEWER
+@given(body=requests(NAMES).flatmap(damaged))
+def test_explanations(channel: grpc.Channel, body: bytes) -> None:
+    """A request of Predict is one of Explain, but for its scene and options."""
+    explain = channel.unary_unary("/cab.forecast.v1.ExplanationService/Explain")
+    try:
+        answer = explain(body, timeout=30)
+    except grpc.RpcError as error:
+        expected_code(error)
+        return
+    for one in explanation_pb.ExplainResponse.FromString(answer).explanations:
+        assert np.isfinite([one.state.nearer, one.map.nearer, one.neighbors.nearer]).all()
 
 
 @FEWER

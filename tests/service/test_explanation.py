@@ -280,8 +280,6 @@ async def test_few_explanations_wait() -> None:
         fake.free.clear()
         request = as_explain_request(make_request(1))
         waiting = [asyncio.create_task(one.explain(request)) for _ in range(MAX_WAITING + 1)]
-        calls = server.dataplane.explain.__self__._calls
-        del calls
         await until(fake.entered.is_set)
         await asyncio.sleep(0.1)
         with pytest.raises(Overloaded, match=f"{MAX_WAITING} explanations are waiting"):

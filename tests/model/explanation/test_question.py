@@ -51,7 +51,8 @@ def explain(
 
 def end_point(forecaster: Forecaster, scene: Scene, target: int = TARGET) -> Floats:
     """Return where the forecast of an agent ends: [2]."""
-    return end_points(forecaster(scene, np.array([target])))[0]
+    point: Floats = end_points(forecaster(scene, np.array([target])))[0]
+    return point
 
 
 def same_speed(scene: Scene, *others: float) -> Donors:

@@ -10,7 +10,7 @@ import pytest
 from pydantic import SecretStr
 from structlog.testing import capture_logs
 
-from cab.forecast.v1.routes import LIST_MODELS, PREDICT, RESET_SCENE, WATCH_SCENE, Route
+from cab.forecast.v1.routes import EXPLAIN, LIST_MODELS, PREDICT, RESET_SCENE, WATCH_SCENE, Route
 from service.access.gate import TOKENS_NAME, Gate, require_protection
 from service.access.key_file import Key, digest, write_keys
 from service.access.scopes import Scope, scope_of
@@ -31,7 +31,7 @@ def file(tmp_path: Path) -> Path:
 
 
 def test_every_method_has_a_scope() -> None:
-    assert scope_of(PREDICT) is Scope.PREDICT
+    assert scope_of(PREDICT) is scope_of(EXPLAIN) is Scope.PREDICT
     assert scope_of(WATCH_SCENE) is Scope.READ
     assert scope_of(RESET_SCENE) is Scope.RESET
     assert scope_of(LIST_MODELS) is None
