@@ -135,7 +135,7 @@ def test_noise_for_a_message(http: httpx.Client, body: bytes) -> None:
 @given(body=requests(NAMES).flatmap(damaged))
 def test_explanations(channel: grpc.Channel, body: bytes) -> None:
     """A request of Predict is one of Explain, but for its scene and options."""
-    explain = channel.unary_unary("/cab.forecast.v1.ExplanationService/Explain")
+    explain = channel.unary_unary("/cab.forecast.v1.ExplanationService/Explain", None, None)
     try:
         answer = explain(body, timeout=30)
     except grpc.RpcError as error:
