@@ -153,8 +153,7 @@ def _cut_single(views: Sequence[MapView]) -> Float32s:
 
 def _draw(layers: Bytes, outside: float, image: Float32s) -> None:
     """Draw layers of 0 and 1 as −1 and 1, relative to the value outside: samples there count as zero."""
-    np.multiply(layers, np.float32(2), out=image)
-    image -= np.float32(2 * outside)
+    np.take(np.array([-2 * outside, 2 - 2 * outside], dtype=np.float32), layers, out=image, mode="clip")
 
 
 def _sample(
@@ -170,7 +169,7 @@ def _sample(
         geometry: geometry of the patches.
         outside: value of pixels outside the images, in [0, 1].
     """
-    grid = _grid(scale, center, heading, (images.shape[2], images.shape[3]), geometry)
+    grid = torch.from_numpy(_grid(scale, center, heading, (images.shape[2], images.shape[3]), geometry))
     sampled: Float32s = functional.grid_sample(
         images, grid, mode="bilinear", padding_mode="zeros", align_corners=False
     ).numpy()
@@ -296,10 +295,11 @@ def _coarsened(layers: Bytes, factor: int) -> Bytes:
 
 def _grid(
     scale: Floats, center: Floats, heading: Floats, shape: tuple[int, int], geometry: PatchGeometry
-) -> Tensor:
+) -> Float32s:
     """Return the sampling point of each patch pixel in the coordinates of ``grid_sample``: [N, S, S, 2].
 
-    They have the column first, and ∓1 lies half a pixel outside the outermost pixels.
+    They have the column first, and ∓1 lies half a pixel outside the outermost pixels. Computed in numpy: each
+    operation of torch, however small, hands the interpreter over to threads that wait for it.
 
     Args:
         scale: [N], pixels of the sampled image per pixel of the patch.
@@ -312,16 +312,13 @@ def _grid(
     # pixel = center + i' (cos, sin) + j' (−sin, cos), with i' and j' relative to the agent's row and column
     ahead, left = np.stack([sin, cos], axis=1), np.stack([cos, -sin], axis=1)  # [N, (column, row)]
     half = np.array([shape[1], shape[0]]) / 2
-    start = _float32((center[:, ::-1] + 0.5) / half - 1)[:, :, None]
-    index = torch.arange(geometry.size, dtype=torch.float32)
-    along = start + (index - geometry.rows_behind) * _float32(ahead / half)[:, :, None]  # [N, 2, S]
-    across = (index - geometry.columns_right) * _float32(left / half)[:, :, None]
+    start = ((center[:, ::-1] + 0.5) / half - 1).astype(np.float32)[:, :, None]
+    index = np.arange(geometry.size, dtype=np.float32)
+    along = start + (index - geometry.rows_behind) * (ahead / half).astype(np.float32)[:, :, None]
+    across = (index - geometry.columns_right) * (left / half).astype(np.float32)[:, :, None]
     # The two coordinates lie in planes of their own: sums of long rows take a third of the time
-    return (along[..., :, None] + across[..., None, :]).permute(0, 2, 3, 1)
-
-
-def _float32(values: Floats) -> Tensor:
-    return torch.from_numpy(values.astype(np.float32))
+    grid: Float32s = (along[..., :, None] + across[..., None, :]).transpose(0, 2, 3, 1)
+    return grid
 
 
 def reduced(layers: Bytes, max_pixels: int) -> tuple[Bytes, int]:

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import structlog
 import torch
@@ -33,8 +33,11 @@ _T = TypeVar("_T")
 
 _CUT_IN_THREADS = 8
 """Agents of a batch from which on map patches are cut in several threads."""
-_MIN_SECOND_AGENTS = 16
-"""Agents in the queue from which on a second forward starts beside the first in any case."""
+_MANY_AGENTS = 16
+"""Agents in the queue from which on a forward starts beside another one in any case."""
+_AHEAD_SECONDS = 0.015
+"""Seconds before the end of a forward from which on its thread is given the next batch: the event loop may be
+busy for as long when it ends."""
 _SPARE_SECONDS = 0.01
 """Seconds that a forward outside the queue may be expected to take."""
 _POLL = 0.002
@@ -78,6 +81,18 @@ class Outcome:
     """Seconds of ``inference`` before the network began, in which map patches were cut."""
 
 
+class _Forwarded(NamedTuple):
+    """Result of a forward, and its time."""
+
+    mixture: TrajectoryMixture
+    started: float
+    """Start by ``time.perf_counter``."""
+    seconds: float
+    """Duration."""
+    patches: float
+    """Seconds of these in which map patches were cut."""
+
+
 @dataclass(eq=False)
 class _Entry:
     """A job, or a part of one, that fits a batch."""
@@ -113,18 +128,34 @@ class _Entry:
         return self.done.done()
 
 
+@dataclass(eq=False)
+class _Batch:
+    """Entries that share a forward, in the model or about to be."""
+
+    entries: list[_Entry]
+    since: float
+    """Time when it was given to its thread, by ``time.perf_counter``."""
+    until: float
+    """Time on the event loop's clock when it should be done."""
+    task: "asyncio.Task[None] | None" = None
+
+    @property
+    def agents(self) -> int:
+        """Number of agents."""
+        return sum(entry.agents for entry in self.entries)
+
+
 class _Slot:
-    """Thread of forwards, and the batch that is in it."""
+    """Thread of forwards, and the batches that it was given: the one in the model, and perhaps the next."""
 
     def __init__(self, number: int) -> None:
         self.thread = ThreadPoolExecutor(1, thread_name_prefix=f"forward-{number}")
-        self.batch: list[_Entry] = []
-        """Empty while the slot is free."""
-        self.since = 0.0
-        """Start of the batch, by ``time.perf_counter``."""
-        self.until = 0.0
-        """Time on the event loop's clock when the batch should be done."""
-        self.task: asyncio.Task[None] | None = None
+        self.batches: list[_Batch] = []
+
+    @property
+    def until(self) -> float:
+        """Time on the event loop's clock when all its batches should be done; 0 while it is free."""
+        return self.batches[-1].until if self.batches else 0.0
 
 
 class Batcher:
@@ -164,7 +195,7 @@ class Batcher:
     def forward_seconds(self) -> float:
         """Seconds since the oldest batch in the model started; 0 while the model is free."""
         now = time.perf_counter()
-        return max((now - slot.since for slot in self._slots if slot.batch), default=0.0)
+        return max((now - batch.since for batch in self._batches), default=0.0)
 
     def start(self, on_crash: Callable[[], None] | None = None) -> None:
         """Start the worker on the running event loop.
@@ -178,7 +209,7 @@ class Batcher:
 
     async def stop(self) -> None:
         """Fail the queued jobs, and wait for the batches that are in the model."""
-        tasks = [task for task in (self._worker, *(slot.task for slot in self._slots)) if task is not None]
+        tasks = [task for task in (self._worker, *(batch.task for batch in self._batches)) if task]
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
@@ -239,7 +270,7 @@ class Batcher:
     @property
     def is_free(self) -> bool:
         """True if no call waits for the model or is in it."""
-        return not (self._busy or self._admission.waiting or self._queue)
+        return not (self._batches or self._admission.waiting or self._queue)
 
     async def until_free(self, until: float = math.inf) -> bool:
         """Wait until no call waits for the model or is in it, and return True.
@@ -266,11 +297,11 @@ class Batcher:
         return await self._run_alone(job, self._slots[-1], self._widths[-1], usual=False)
 
     async def _run_alone(self, job: Job, slot: _Slot, width: int, usual: bool = True) -> Outcome:
-        mixture, seconds, patches = await asyncio.get_running_loop().run_in_executor(
+        done = await asyncio.get_running_loop().run_in_executor(
             slot.thread, _forward, job, [job.inputs], job.steps, width, self._cutters
         )
-        self._costs.measure(job.key, job.agents, seconds, usual=usual)
-        return Outcome(mixture, 0.0, seconds, job.agents, patches)
+        self._costs.measure(job.key, job.agents, done.seconds, usual=usual)
+        return Outcome(done.mixture, 0.0, done.seconds, job.agents, done.patches)
 
     def forget(self, forecasters: Iterable[Forecaster]) -> None:
         """Forget how long the forwards of models take that are gone."""
@@ -300,77 +331,85 @@ class Batcher:
                 entry.done.exception()  # retrieved, or asyncio would log that it never was
 
     @property
-    def _busy(self) -> list[_Slot]:
-        return [slot for slot in self._slots if slot.batch]
+    def _batches(self) -> list[_Batch]:
+        return [batch for slot in self._slots for batch in slot.batches]
 
     async def _work(self) -> None:
-        """Start batches as long as a slot is free and work is queued."""
+        """Give batches to slots as long as work is queued and a slot is free or about to be."""
+        loop = asyncio.get_running_loop()
+        timer: asyncio.TimerHandle | None = None
         while True:
             await self._wake.wait()
             self._wake.clear()
+            if timer is not None:
+                timer.cancel()
             while self._queue and (slot := self._free_slot()):
-                slot.batch = self._take_batch()
-                if slot.batch:
-                    self._start(slot)
+                entries = self._take_batch(max(loop.time(), slot.until))
+                if entries:
+                    self._start(slot, entries)
+            if self._queue:
+                first = min(slot.until for slot in self._slots if slot.batches)
+                timer = loop.call_at(first - _AHEAD_SECONDS, self._wake.set)
 
     def _free_slot(self) -> _Slot | None:
-        """Return the slot for the next batch; None: it waits for the end of a forward.
+        """Return the slot for the next batch; None: it waits.
 
-        A second forward of a few agents only starts if it ends before the first: the first one's end would
-        find more of them, and a shared forward takes less time than two.
+        A forward of a few agents beside another one, or right behind it, only starts if it ends before the
+        other: at the end of that more of them will have come, and a shared forward takes less time than two.
         """
-        free = next((slot for slot in self._slots if not slot.batch), None)
-        busy = self._busy
-        if free is None or not busy or self._queue.agents >= min(_MIN_SECOND_AGENTS, self._max_batch):
-            return free
-        first = next(iter(self._queue))
+        idle = next((slot for slot in self._slots if not slot.batches), None)
+        busy = [slot for slot in self._slots if slot.batches]
+        if idle is not None and not busy:
+            return idle
+        first = min(busy, key=lambda slot: (len(slot.batches), slot.until))
         now = asyncio.get_running_loop().time()
-        ends = now + self._costs.seconds(first.key, first.agents)
-        return free if ends < min(slot.until for slot in busy) else None
+        if self._queue.agents >= min(_MANY_AGENTS, self._max_batch):
+            ahead = len(first.batches) == 1 and now >= first.until - _AHEAD_SECONDS
+            return idle or (first if ahead else None)
+        entry = next(iter(self._queue))
+        return idle if now + self._costs.seconds(entry.key, entry.agents) < first.until else None
 
-    def _start(self, slot: _Slot) -> None:
-        """Start the forward of a slot's batch: with all cores if it is alone, else with a part of them."""
+    def _start(self, slot: _Slot, entries: list[_Entry]) -> None:
+        """Give a batch to a slot; its forward has all cores if it is alone, else a part of them."""
         loop = asyncio.get_running_loop()
-        batch = slot.batch
-        is_alone = len(self._busy) == 1 and not self._queue
-        width = self._widths[0 if is_alone else -1]
-        slot.since = time.perf_counter()
-        slot.until = loop.time() + self._costs.seconds(batch[0].key, sum(entry.agents for entry in batch))
+        width = self._widths[-1 if self._batches or self._queue else 0]
+        batch = _Batch(entries, time.perf_counter(), max(loop.time(), slot.until))
+        batch.until += self._costs.seconds(entries[0].key, batch.agents)
+        slot.batches.append(batch)
         self._tell_admission()
-        slot.task = asyncio.create_task(self._run_batch(slot, width), name="forward")
-        slot.task.add_done_callback(self._check)
+        job = entries[0].job
+        steps = max(entry.job.steps for entry in entries)
+        parts = [entry.inputs for entry in entries]
+        # Not in the task, which begins only after all that the event loop has to do now
+        running = loop.run_in_executor(slot.thread, _forward, job, parts, steps, width, self._cutters)
+        batch.task = asyncio.create_task(self._finish(slot, batch, running), name="forward")
+        batch.task.add_done_callback(self._check)
 
     def _tell_admission(self) -> None:
         """Tell the admission when a slot should be free."""
-        ends = [slot.until for slot in self._busy]
-        self._admission.busy_until = min(ends) if len(ends) == len(self._slots) else None
+        ends = [slot.until for slot in self._slots]
+        self._admission.busy_until = min(ends) or None
 
-    async def _run_batch(self, slot: _Slot, width: int) -> None:
-        batch, started = slot.batch, slot.since
-        job = batch[0].job
-        steps = max(entry.job.steps for entry in batch)
-        parts = [entry.inputs for entry in batch]
-        running = asyncio.get_running_loop().run_in_executor(
-            slot.thread, _forward, job, parts, steps, width, self._cutters
-        )
+    async def _finish(self, slot: _Slot, batch: _Batch, running: "asyncio.Future[_Forwarded]") -> None:
+        """Deliver a batch once its forward is done."""
         try:
-            mixture, seconds, patches = await asyncio.shield(running)
+            done = await asyncio.shield(running)
         except asyncio.CancelledError:  # the batcher stops; a batch that has started is finished first
             await asyncio.wait([running])
-            self._fail(batch, Unavailable("the server is stopping"))
+            self._fail(batch.entries, Unavailable("the server is stopping"))
             raise
         except Exception:
             _log.exception(
                 "forward failed",
-                model=job.forecaster.info.name,
-                agents=sum(entry.agents for entry in batch),
-                request_ids=sorted({entry.call.request_id for entry in batch}),
+                model=batch.entries[0].job.forecaster.info.name,
+                agents=batch.agents,
+                request_ids=sorted({entry.call.request_id for entry in batch.entries}),
             )
-            self._fail(batch, Internal())
+            self._fail(batch.entries, Internal())
         else:
-            self._measure(batch, started, seconds)
-            self._deliver(batch, mixture, started, seconds, patches)
-        slot.batch = []
+            self._measure(batch, done)
+            self._deliver(batch.entries, done)
+        slot.batches.remove(batch)
         self._tell_admission()
         self._wake.set()
 
@@ -381,17 +420,21 @@ class Batcher:
         _log.critical("batcher crashed", exc_info=worker.exception())
         self._crashed = True
         for slot in self._slots:
-            self._fail(slot.batch, Internal())
-            slot.batch = []
+            for batch in slot.batches:
+                self._fail(batch.entries, Internal())
+            slot.batches = []
         self._fail(self._queue, Internal())
         self._queue.clear()
         if self._on_crash is not None:
             self._on_crash()
 
-    def _take_batch(self) -> list[_Entry]:
-        """Take the most urgent batch, and fail the entries that would be late."""
-        now = asyncio.get_running_loop().time()
-        batch, late, departure = self._queue.take_batch(now, self._max_batch)
+    def _take_batch(self, start: float) -> list[_Entry]:
+        """Take the most urgent batch, and fail the entries that would be late.
+
+        Args:
+            start: time on the event loop's clock when its forward can start.
+        """
+        batch, late, departure = self._queue.take_batch(start, self._max_batch)
         for entry in late:
             self._metrics.refused.labels("dropped").inc()
             entry.done.set_exception(DeadlineExceeded())
@@ -401,41 +444,32 @@ class Batcher:
             self._admission.release(entry.call, entry.agents)
         return batch
 
-    def _deliver(
-        self,
-        batch: Sequence[_Entry],
-        mixture: TrajectoryMixture,
-        started: float,
-        seconds: float,
-        patches: float,
-    ) -> None:
-        agents = len(mixture)
+    def _deliver(self, batch: Sequence[_Entry], done: _Forwarded) -> None:
+        agents = len(done.mixture)
         position = 0
         for entry in batch:
-            part = mixture[position : position + entry.agents]
+            part = done.mixture[position : position + entry.agents]
             position += entry.agents
             if not entry.done.done():
-                queue = started - entry.call.started
-                outcome = Outcome(_cut(part, entry.job.steps), queue, seconds, agents, patches)
-                entry.done.set_result(outcome)
+                queue = done.started - entry.call.started
+                part = _cut(part, entry.job.steps)
+                entry.done.set_result(Outcome(part, queue, done.seconds, agents, done.patches))
 
     def _fail(self, entries: Iterable[_Entry], error: Internal | Unavailable) -> None:
         for entry in entries:
             if not entry.done.done():
                 entry.done.set_exception(type(error)(error.detail))
 
-    def _measure(self, batch: Sequence[_Entry], started: float, seconds: float) -> None:
-        agents = sum(entry.agents for entry in batch)
-        self._costs.measure(batch[0].key, agents, seconds)
-        self._metrics.batch_agents.observe(agents)
-        self._metrics.inference.labels(batch[0].job.forecaster.info.name).observe(seconds)
-        for entry in batch:
-            self._metrics.queue.observe(started - entry.queued)
+    def _measure(self, batch: _Batch, done: _Forwarded) -> None:
+        first = batch.entries[0]
+        self._costs.measure(first.key, batch.agents, done.seconds)
+        self._metrics.batch_agents.observe(batch.agents)
+        self._metrics.inference.labels(first.job.forecaster.info.name).observe(done.seconds)
+        for entry in batch.entries:
+            self._metrics.queue.observe(done.started - entry.queued)
 
 
-def _forward(
-    job: Job, parts: Sequence[Prepared], steps: int, width: int, cutters: Executor
-) -> tuple[TrajectoryMixture, float, float]:
+def _forward(job: Job, parts: Sequence[Prepared], steps: int, width: int, cutters: Executor) -> _Forwarded:
     """Run one forward of the job's forecaster over the joined parts.
 
     Args:
@@ -446,7 +480,7 @@ def _forward(
         cutters: threads that cut map patches; with one thread the forward's own cuts them.
 
     Returns:
-        The mixture, the seconds that it took, and those of them until patches were cut.
+        The mixture and the time that it took.
 
     Raises:
         RuntimeError: the mixture is not one of the expected agents, modes and steps.
@@ -460,7 +494,7 @@ def _forward(
         patches = time.perf_counter() - started
         mixture = job.forecaster.forecast(features, job.agent_type, job.context, steps)
     require_shapes(job.forecaster.info, mixture, agents, steps)
-    return mixture, time.perf_counter() - started, patches
+    return _Forwarded(mixture, started, time.perf_counter() - started, patches)
 
 
 def require_shapes(info: ModelInfo, mixture: TrajectoryMixture, agents: int, steps: int) -> None:
