@@ -121,7 +121,8 @@ def _line(progress: "Progress") -> str:
         return f"demo: no forecast: {progress.error}"
     median = sorted(progress.seconds)[len(progress.seconds) // 2] if progress.seconds else 0.0
     skipped = f", {progress.skipped} ticks skipped" if progress.skipped else ""
-    return f"{progress.agents} agents, {progress.calls} forecasts, {1e3 * median:.0f} ms each{skipped}"
+    agents = f"{progress.agents} agent{'s' * (progress.agents != 1)}"
+    return f"{agents}, {progress.calls} forecasts, {1e3 * median:.0f} ms each{skipped}"
 
 
 @contextmanager
