@@ -19,6 +19,7 @@ import structlog
 from cab.forecast.v1 import prediction_service_pb2 as pb
 from cab.forecast.v1.bounds import MAX_ID_LENGTH
 from model.forecaster import Context, Forecaster
+from model.scenes.scene import Raster
 from service.errors import UnknownModel
 from service.predict.batcher import Batcher, combine
 from service.predict.catalog import Catalog
@@ -47,6 +48,8 @@ class _Work:
     request: pb.PredictRequest
     options: Options
     agents: Agents
+    raster: Raster | None
+    """Map of the call, decoded; a request that names its map by the digest alone does not hold it."""
     forecaster: Forecaster
     catalog: Catalog
     size: int
@@ -136,7 +139,9 @@ class Shadow:
             consistency=False,
         )
         until = asyncio.get_running_loop().time() + _MAX_AGE
-        self._queue.append(_Work(request, own, plan.agents, forecaster, catalog, size, until))
+        self._queue.append(
+            _Work(request, own, plan.agents, plan.scene.raster, forecaster, catalog, size, until)
+        )
         self._bytes += size
         self._wake.set()
 
@@ -193,6 +198,7 @@ class Shadow:
             work.catalog,
             self._settings,
             work.agents,
+            work.raster,
         )
         groups = [group for group in plan.groups if group.job.forecaster is work.forecaster]
         outcomes = []

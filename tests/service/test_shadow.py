@@ -5,11 +5,12 @@ from collections import Counter
 from collections.abc import Sequence
 from itertools import count
 
+import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
-from cab_forecast import AsyncClient
+from cab_forecast import AsyncClient, scene_raster
 from model.registry import Registry
 from service.predict.catalog import Models
 from service.server import Server
@@ -169,3 +170,15 @@ async def test_a_shadow_that_comes_with_a_reload() -> None:
         await until(lambda: calls(server) == {"done": 1, "dropped": 0, "failed": 0})
     finally:
         await server.stop()
+
+
+async def test_a_map_that_is_named_by_its_digest_is_seen() -> None:
+    async with running(*pair(), **shadowed()) as server:
+        raster = scene_raster(np.ones((3, 200, 200), dtype=np.bool_), (-30, -30))
+        async with AsyncClient(server.grpc_address, timeout=20) as client:
+            for frame in range(3):  # from the second one on by its digest alone
+                request = pb.PredictRequest(scene_id="street", time=NOW + 0.5 * frame, scene_raster=raster)
+                add_agent(request, x=2.5 * frame)
+                await client.predict(request)
+        await until(lambda: sum(calls(server).values()) == 3)
+        assert calls(server) == {"done": 3, "dropped": 0, "failed": 0}
