@@ -7,10 +7,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from cab_forecast import demo_request
 from cli.main import app
 from tests.service.servers import in_thread, settings
 
 run = CliRunner().invoke
+FIRST, SECOND = (agent.id for agent in demo_request().agents[:2])
 
 
 @pytest.fixture(scope="module")
@@ -27,18 +29,18 @@ def endpoint(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_table_and_a_plot_of_two_models(tmp_path: Path) -> None:
     file = tmp_path / "plot.png"
-    options = ["--model=kalman,constant-velocity-yaw", "--agent=car-straight", f"--plot={file}"]
+    options = ["--model=kalman,constant-velocity-yaw", f"--agent={FIRST}", f"--plot={file}"]
     result = run(app, ["explain", "demo", *options])
     assert result.exit_code == 0, result.stderr
-    assert result.stdout.count("car-straight") == 2
-    assert "car-left-turn" not in result.stdout
+    assert result.stdout.count(FIRST) == 2
+    assert SECOND not in result.stdout
     assert "kalman@" in result.stdout
     assert "no donors" in result.stdout
     assert file.stat().st_size > 10_000
 
 
 def test_json() -> None:
-    options = ["--json", "--agent=car-straight", "--baseline=null-context", "--horizon=2"]
+    options = ["--json", f"--agent={FIRST}", "--baseline=null-context", "--horizon=2"]
     result = run(app, ["explain", "demo", *options])
     answer = json.loads(result.stdout.splitlines()[-1])  # before it are lines of the server
     [explanation] = answer["explanations"]

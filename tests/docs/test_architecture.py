@@ -35,6 +35,7 @@ def test_a_named_place_exists(path: str, name: str) -> None:
 def test_the_walks_are_short() -> None:
     assert list(WALKS) == [
         "One Predict call",
+        "One Explain call",
         "One track-memory call",
         "One frame for watchers",
         "One training step",
