@@ -8,6 +8,7 @@ import { ellipse, heading, present } from "./frames.js";
 const FULL = 2 * Math.PI;
 const SIZES = { vehicle: [4.6, 1.9], cyclist: [1.9, 0.8], pedestrian: [0.8, 0.8], unknown: [1.4, 1.4] }; // m
 const SMALLEST = { vehicle: [13, 6], cyclist: [12, 6], pedestrian: [7, 7], unknown: [8, 8] }; // pixels
+const LABEL = { width: 62, height: 13 }; // pixels of a mode's rank
 const ELLIPSE_EVERY = 2; // s, of agents that are not selected
 
 /** Colours of the canvas, from the style sheet. */
@@ -77,6 +78,7 @@ class Painter {
     this.size = size;
     this.left = size.width / 2 - view.x * view.scale;
     this.top = size.height / 2 + view.y * view.scale;
+    this.ranks = []; // places of the ranks that are written
   }
 
   px(x) {
@@ -149,8 +151,12 @@ class Painter {
 
   /** Write the rank of a mode at its end, as the panel numbers it. */
   rank({ mean, weight }, rank) {
-    const text = `${rank + 1} · ${percent(weight)}`;
-    this.text(text, this.px(mean[mean.length - 2]) + 7, this.py(mean[mean.length - 1]) - 7, this.colours.ink);
+    const x = this.px(mean[mean.length - 2]) + 7;
+    let y = this.py(mean[mean.length - 1]) - 7;
+    const covered = ([left, top]) => Math.abs(left - x) < LABEL.width && Math.abs(top - y) < LABEL.height;
+    while (this.ranks.some(covered)) y -= LABEL.height;
+    this.ranks.push([x, y]);
+    this.text(`${rank + 1} · ${percent(weight)}`, x, y, this.colours.ink);
   }
 
   ellipses(agent, selected) {
