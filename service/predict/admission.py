@@ -37,7 +37,10 @@ _MIN_FACTOR, _MAX_FACTOR = 0.5, 4.0
 _TRIAL_SECONDS = 1.0
 """Seconds between calls that are accepted even if they are expected to be late."""
 _TRANSIT = 0.004
-"""Seconds that are left for the response on its way to the client."""
+"""Seconds that are left at least for the request and the response on their ways."""
+_TRANSIT_SHARE = 0.02
+"""Share of the time until the deadline that is left for them. Under overload the queue holds as much work as
+deadlines allow, so that every call is finished just before its deadline."""
 _BATCHES_AHEAD = 2
 """Batches' worth of agents that are planned ahead of the model, so that it never waits."""
 _PRIORITY_SECONDS = 60.0
@@ -398,8 +401,9 @@ class Admission:
             Overloaded: too little time is left.
         """
         expected = self._expected(order, agents, now)
-        needed = (0.0 if is_trial else expected * self._margin.factor) + _TRANSIT
         remaining = order[1] - now
+        transit = max(_TRANSIT, _TRANSIT_SHARE * remaining)
+        needed = (0.0 if is_trial else expected * self._margin.factor) + transit
         if needed > remaining:
             self._metrics.refused.labels("late").inc()
             raise Overloaded(
