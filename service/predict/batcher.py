@@ -23,7 +23,7 @@ from model.mixture import TrajectoryMixture
 from model.scenes.scene import AgentType
 from service.errors import DeadlineExceeded, Internal, Unavailable
 from service.predict.admission import Admission, Call
-from service.predict.scheduler import DeadlineQueue
+from service.predict.scheduler import MAX_BATCH_SECONDS, DeadlineQueue
 from service.predict.torch_threads import set_helper_threads
 from service.telemetry.metrics import Metrics
 
@@ -259,12 +259,15 @@ class Batcher:
     async def run_in_model_threads(self, job: Job) -> float:
         """Run a job past the queue once with each number of threads, for warm-up, and learn its duration.
 
+        A large one only runs with all threads: beside another forward batches are smaller.
+
         Returns:
             The seconds of the slowest forward.
         """
         slowest = 0.0
-        for slot, width in reversed(list(zip(self._slots, self._widths, strict=True))):
-            slowest = max(slowest, (await self._run_alone(job, slot, width)).inference)
+        for slot, width in zip(self._slots, self._widths, strict=True):
+            if slowest < MAX_BATCH_SECONDS:
+                slowest = max(slowest, (await self._run_alone(job, slot, width)).inference)
         return slowest
 
     @property
