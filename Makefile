@@ -16,7 +16,7 @@ AUDIT_FLAGS ?=
 PROTOC := PATH="$(CURDIR)/$(BIN):$$PATH" python -m grpc_tools.protoc
 PROTOS := $(wildcard proto/cab/forecast/v1/*.proto)
 
-.PHONY: install run test test-system test-nuscenes bench loadtest peers peers-install faults lint format docs proto proto-check proto-lint audit lock clean
+.PHONY: install run test test-system test-nuscenes bench loadtest peers peers-install faults lint format docs docs-site proto proto-check proto-lint audit lock clean
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -80,6 +80,9 @@ faults: install  ## forecast while descriptors, disk, checkpoint, process and Re
 
 docs: install  ## generate the tables of settings and metrics in docs/
 	$(BIN)/python -m docs.generate
+
+docs-site: docs  ## build the documentation as a site in build/site; a broken link or anchor fails
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 proto: install  ## generate the Python code from proto/
 	$(PROTOC) -Iproto --python_out=proto --mypy_out=proto --grpc_python_out=proto \

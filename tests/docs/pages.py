@@ -3,6 +3,8 @@
 import re
 from pathlib import Path
 
+from docs.mkdocs_hooks import slug
+
 ROOT = Path(__file__).resolve().parents[2]
 README = ROOT / "README.md"
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), ROOT / "deploy/README.md"])
@@ -52,7 +54,4 @@ def links(page: Path) -> list[str]:
 
 def anchors(page: Path) -> set[str]:
     """Return the anchors that GitHub gives the headings of a page."""
-    return {
-        re.sub(r"[^\w\- ]", "", heading.replace("`", "").lower()).replace(" ", "-")
-        for heading in _HEADING.findall(prose(page))
-    }
+    return {slug(heading) for heading in _HEADING.findall(prose(page))}

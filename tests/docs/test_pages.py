@@ -21,7 +21,11 @@ from tests.docs.pages import PAGES, README, ROOT, anchors, commands, links, name
 
 MAX_README_BYTES = 8_000
 MAX_PICTURE_BYTES = 150_000
-_FOLDERS = {folder.name for folder in ROOT.iterdir() if folder.is_dir() and not folder.name.startswith(".")}
+_FOLDERS = {
+    folder.name
+    for folder in ROOT.iterdir()
+    if folder.is_dir() and not folder.name.startswith(".") and folder.name != "build"  # which make writes
+}
 _PATH = re.compile(r"[\w.-]+(?:/[\w.*-]*)+")
 _MODULE = re.compile(r"(?:model|service|benchmark|loadtest|cab_forecast|cli|docs)(?:\.(?!yml|py|md)\w+)+")
 _FOREIGN_FLAGS = {
