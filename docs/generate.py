@@ -6,13 +6,15 @@ between the two is written from the code or the data file; the rest of the page 
 
 import json
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import typer
 
 from cli.main import app
+from docs import contract_reference
+from docs.tables import table
 from loadtest.peers.report import Comparisons
 from service.settings_reference import settings_reference
 
@@ -45,12 +47,6 @@ def render(page: str) -> str:
         filled = f"{begin}\n\n{make()}\n\n{end}"
         text = part.sub(lambda _, filled=filled: filled, text)  # type: ignore[misc]
     return text
-
-
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a Markdown table without a line end after the last row."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(("|" + "|".join(line) + "|") if line[0] == "---" else _line(line) for line in lines)
 
 
 def settings_table() -> str:
@@ -215,6 +211,37 @@ def consistency_table() -> str:
     )
 
 
+def scale_table() -> str:
+    """Return a row for each main figure, with those of three models from the simplest to the best."""
+    models = ("constant-velocity-yaw", "trajectron-no-context", "cab")
+    rows = {
+        model: {
+            name: value
+            for key in ("displacement_causal", "consistency_causal")
+            for row in benchmark(key)
+            if row["model"] == model
+            for name, value in row.items()
+        }
+        for model in models
+    }
+    figures: dict[str, Callable[[Row], str]] = {
+        "FDE at 1 s, m": lambda row: _two(row["fde"][0]),
+        "FDE at 3 s, m": lambda row: _two(row["fde"][2]),
+        "FDE at 6 s, m": lambda row: _two(row["fde"][5]),
+        "minADE₁₀, m": lambda row: _two(row["min_ade_10"]),
+        "NLL, nats a step": lambda row: _two(row["nll"]),
+        "in 50 / 90 / 99 %": lambda row: _slashed(row["inside_50_90_99"], str),
+        "OffR": lambda row: _two(row["off_road"]),
+        "D, std, m": lambda row: _two(row["dispersion_std"]),
+        "C(1 m), s": lambda row: _two(row["convergence_1"]),
+        "hardest 1 %, m": lambda row: "{:.1f}".format(row["hardest_fde_1_2_3"][0]),
+    }
+    return table(
+        ["Figure", *models],
+        [[figure, *(show(rows[model]) for model in models)] for figure, show in figures.items()],
+    )
+
+
 def benchmark(key: str) -> list[Row]:
     """Return the rows of one table of the benchmark figures."""
     rows: list[Row] = json.loads(BENCHMARK.read_text(encoding="utf-8"))[key]
@@ -222,6 +249,11 @@ def benchmark(key: str) -> list[Row]:
 
 
 PAGES: dict[str, dict[str, Callable[[], str]]] = {
+    "contract.md": {
+        "methods": contract_reference.methods_table,
+        "contract": contract_reference.contract,
+    },
+    "figures.md": {"scale": scale_table},
     "performance.md": {"peers": lambda: Comparisons.read(PEERS).markdown()},
     "settings.md": {"settings": settings_table},
     "warnings.md": {"clean": clean_warnings_table, "faults": faults_table},
@@ -251,10 +283,6 @@ def _quoted(choices: str) -> str:
 
 def _markdown(meaning: str) -> str:
     return meaning.replace("``", "`").replace("|", "\\|")
-
-
-def _line(cells: Sequence[str]) -> str:
-    return "|" + "|".join(f" {cell} " if cell else " " for cell in cells) + "|"
 
 
 def _two(value: float | None) -> str:

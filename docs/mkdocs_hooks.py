@@ -49,7 +49,7 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
     copies = {path for page in files.documentation_pages() for path in _linked_files(page)}
     for path in sorted(copies):
         if path.endswith(".md"):
-            _log.warning("%s, to which a page links, is no page: add it to OUTSIDE in %s", path)
+            _log.warning("%s, to which a page links, is no page: add it to OUTSIDE", path)
         else:
             files.append(File.generated(config, _COPIES + path, abs_src_path=str(ROOT / path)))
     return files

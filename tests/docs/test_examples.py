@@ -3,11 +3,14 @@
 import json
 import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
+from model import registry
 from service.server import Server
 from service.settings import Settings
 from tests.docs.pages import PAGES, README, ROOT, blocks, name
@@ -66,6 +69,22 @@ def test_the_example_of_the_benchmark(
     exec(code, {})  # noqa: S102
     assert float(capsys.readouterr().out) > 0
     assert {"results.json", "tables.md"} <= {file.name for file in (tmp_path / "runs/kalman").iterdir()}
+
+
+def test_the_example_of_a_baseline(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model, run = blocks(ROOT / "docs/baseline.md", "python")
+    module = ModuleType("model.baselines.slowing")
+    exec(model, vars(module))  # noqa: S102
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setattr(registry, "_BASELINES", (*registry._BASELINES, module.__name__))
+    assert registry.Registry.load(None).get("slowing").info.full_name == "slowing@1.0.0"
+    monkeypatch.chdir(tmp_path)
+    exec(run, {})  # noqa: S102
+    printed = dict(line.split()[:2] for line in capsys.readouterr().out.splitlines())
+    assert {"kalman", "slowing"} <= printed.keys()
+    assert all(0 < float(error) < 50 for error in printed.values())
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)

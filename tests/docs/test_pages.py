@@ -11,6 +11,7 @@ import typer
 from typer.core import TyperGroup
 
 import loadtest.__main__
+from cab.forecast.v1.prediction_service_pb2 import ForecastStatus
 from cli.main import app
 from docs import generate
 from model.networks.config import NetworkConfig
@@ -112,7 +113,7 @@ def test_flags_alone_exist(page: Path) -> None:
 
 @pages
 def test_environment_variables_are_settings(page: Path) -> None:
-    known = {PREFIX + setting.upper() for setting in Settings.model_fields} | {CONFIG}
+    known = {PREFIX + setting.upper() for setting in Settings.model_fields} | {CONFIG, *ForecastStatus.keys()}
     named = set(re.findall(rf"(?<!CAB_)\b{PREFIX}[A-Z_]*[A-Z]", page.read_text(encoding="utf-8")))
     assert named <= known
 
