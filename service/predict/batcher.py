@@ -350,9 +350,10 @@ class Batcher:
                 entries = self._take_batch(max(loop.time(), slot.until))
                 if entries:
                     self._start(slot, entries)
-            if self._queue:
-                first = min(slot.until for slot in self._slots if slot.batches)
-                timer = loop.call_at(first - _AHEAD_SECONDS, self._wake.set)
+            first = self._first_busy()
+            if self._queue and first is not None and first.until - _AHEAD_SECONDS > loop.time():
+                timer = loop.call_at(first.until - _AHEAD_SECONDS, self._wake.set)
+            # Behind that time nothing changes until work comes or a forward ends, and both wake this task
 
     def _free_slot(self) -> _Slot | None:
         """Return the slot for the next batch; None: it waits.
@@ -361,16 +362,20 @@ class Batcher:
         other: at the end of that more of them will have come, and a shared forward takes less time than two.
         """
         idle = next((slot for slot in self._slots if not slot.batches), None)
-        busy = [slot for slot in self._slots if slot.batches]
-        if idle is not None and not busy:
+        first = self._first_busy()
+        if first is None:
             return idle
-        first = min(busy, key=lambda slot: (len(slot.batches), slot.until))
         now = asyncio.get_running_loop().time()
         if self._queue.agents >= min(_MANY_AGENTS, self._max_batch):
             ahead = len(first.batches) == 1 and now >= first.until - _AHEAD_SECONDS
             return idle or (first if ahead else None)
         entry = next(iter(self._queue))
         return idle if now + self._costs.seconds(entry.key, entry.agents) < first.until else None
+
+    def _first_busy(self) -> _Slot | None:
+        """Return the busy slot that needs its next batch first; None: all are free."""
+        busy = (slot for slot in self._slots if slot.batches)
+        return min(busy, key=lambda slot: (len(slot.batches), slot.until), default=None)
 
     def _start(self, slot: _Slot, entries: list[_Entry]) -> None:
         """Give a batch to a slot; its forward has all cores if it is alone, else a part of them."""
@@ -412,6 +417,8 @@ class Batcher:
         else:
             self._measure(batch, done)
             self._deliver(batch.entries, done)
+        if self._crashed:  # the slots have been cleared
+            return
         slot.batches.remove(batch)
         self._tell_admission()
         self._wake.set()

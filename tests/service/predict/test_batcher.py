@@ -350,6 +350,29 @@ async def test_a_crash_of_the_worker_fails_every_call(
     await batcher.stop()
 
 
+async def test_a_crash_beside_another_forward_is_told_once(
+    fake: FakeForecaster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    crash = Mock()
+    batcher = Batcher(8, Admission(8, 20, Metrics()), Metrics(), (2, 1))
+    batcher.start(crash)
+    other = FakeForecaster()
+    other.free.clear()
+    calls = [submit(batcher, job(fake, 8)), submit(batcher, job(other, 8))]
+    await asyncio.gather(entered_again(fake), entered_again(other))
+    monkeypatch.setattr(batcher, "_deliver", Mock(side_effect=[RuntimeError("a bug"), None]))
+    tasks = [batch.task for batch in batcher._batches if batch.task]
+    for forecaster in (fake, other):
+        forecaster.free.set()
+    for call in calls:
+        with pytest.raises(Internal):
+            await call
+    await asyncio.wait(tasks)
+    await settle()
+    crash.assert_called_once_with()
+    await batcher.stop()
+
+
 async def test_a_stop_is_no_crash(fake: FakeForecaster) -> None:
     crashed = asyncio.Event()
     batcher = Batcher(8, Admission(8, 20, Metrics()), Metrics())
@@ -504,6 +527,25 @@ async def test_few_agents_wait_for_a_forward_that_ends_before_theirs_would(
     assert len(fake.batches) == forwards
     fake.free.set()
     await asyncio.gather(first, small)
+
+
+@pytest.mark.parametrize("widths", [(1,), (2, 1)])
+async def test_the_event_loop_rests_while_few_agents_wait(
+    fake: FakeForecaster, monkeypatch: pytest.MonkeyPatch, widths: tuple[int, ...]
+) -> None:
+    batcher = Batcher(32, Admission(32, 64, Metrics()), Metrics(), widths)
+    batcher.start()
+    first = await hold(batcher, fake)
+    second = submit(batcher, job(fake, 1))
+    await settle()
+    look = Mock(side_effect=batcher._free_slot)
+    monkeypatch.setattr(batcher, "_free_slot", look)
+    await asyncio.sleep(0.05)  # longer than the forward was expected to take
+    assert look.call_count <= 2
+    fake.free.set()
+    assert await first
+    assert await second
+    await batcher.stop()
 
 
 async def test_warm_up_runs_with_each_number_of_threads(pair: Batcher, fake: FakeForecaster) -> None:
