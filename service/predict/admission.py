@@ -403,7 +403,10 @@ class Admission:
         expected = self._expected(order, agents, now)
         remaining = order[1] - now
         transit = max(_TRANSIT, _TRANSIT_SHARE * remaining)
-        needed = (0.0 if is_trial else expected * self._margin.factor) + transit
+        # Where nothing goes first, a refusal would only leave the model idle: a likely success is enough
+        idle = self.busy_until is None and self._waiting == 0
+        margin = min(self._margin.factor, 1.0) if idle else self._margin.factor
+        needed = (0.0 if is_trial else expected * margin) + transit
         if needed > remaining:
             self._metrics.refused.labels("late").inc()
             raise Overloaded(

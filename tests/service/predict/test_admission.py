@@ -98,6 +98,21 @@ async def test_a_free_model_tries_a_call_a_second_that_is_expected_to_be_late(
         calls.begin(500, seconds=0.1)
 
 
+async def test_no_margin_keeps_a_call_from_a_free_model() -> None:
+    admission = make()
+    for _ in range(100):
+        admission._margin.measure(0.1, 0.3)
+    assert admission._margin.factor > 2
+    with pytest.raises(Overloaded), Calls(admission) as calls:  # of 64 agents, expected to take 64 + 10 ms
+        calls.begin(64, seconds=0.1)
+    admission.busy_until = None
+    admission._tried = now()  # no trial
+    with Calls(admission) as calls:
+        calls.begin(64, seconds=0.1)
+        with pytest.raises(Overloaded):  # behind the first one
+            calls.begin(64, seconds=0.2)
+
+
 async def test_work_that_goes_later_is_no_wait() -> None:
     admission = make()
     with Calls(admission) as calls:
