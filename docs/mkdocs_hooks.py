@@ -21,6 +21,7 @@ OUTSIDE = {
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
     "deploy/README.md": "deployment.md",
+    "examples/README.md": "examples.md",
 }
 """Pages of the site by their files outside of docs/."""
 _COPIES = "source/"
