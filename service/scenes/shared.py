@@ -156,8 +156,12 @@ class SharedScenes:
     async def _send(self) -> None:
         while True:
             scene_id, frame = await self._queue.get()
-            with suppress(StoreError):
+            try:
                 await self._put_frame(scene_id, frame)
+            except StoreError:
+                pass  # the guard counts and logs it
+            except Exception:  # of one frame, which must not end all that follow
+                _log.exception("frame is not sent to other servers", scene_id=scene_id)
 
     async def _put_frame(self, scene_id: str, frame: PublishedFrame) -> None:
         encoded = await frame.message.encoded(to_protobuf)

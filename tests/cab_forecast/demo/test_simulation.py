@@ -15,7 +15,7 @@ from cab_forecast.demo.simulation import Simulation, User
 from cab_forecast.demo.world import Light, World
 from cab_forecast.layers import Layers, decode_layers
 
-SECONDS = 60.0
+SECONDS = 40.0
 STEP = 0.1
 LATERAL = 4.0
 """Maximum lateral acceleration, m/s²."""
@@ -52,8 +52,8 @@ def made(name: str) -> World:
 
 
 @cache
-def minute(name: str) -> list[Step]:
-    """Simulate a minute of a scene."""
+def a_while(name: str) -> list[Step]:
+    """Simulate a while of a scene."""
     return list(_steps(Simulation(made(name), seed=5)))
 
 
@@ -99,7 +99,7 @@ def _event(user: User, simulation: Simulation) -> str:
 
 
 def test_nobody_overlaps(name: str) -> None:
-    for step in minute(name):
+    for step in a_while(name):
         touching = np.ones((len(step.users),) * 2, dtype=np.bool_)
         for axes in (step.ahead, np.stack([-step.ahead[:, 1], step.ahead[:, 0]], axis=-1)):
             places = np.einsum("ni,mki->nmk", axes, step.corners)  # of m's corners along n's axis
@@ -112,7 +112,7 @@ def test_nobody_overlaps(name: str) -> None:
 
 def test_accelerations_are_within_physical_bounds(name: str) -> None:
     headings: dict[str, tuple[float, float]] = {}
-    for step in minute(name):
+    for step in a_while(name):
         speed, acceleration, heading, _ = step.states.T
         assert speed.min() >= 0
         assert acceleration.min() >= -HARDEST_BRAKING - 1e-6
@@ -126,14 +126,14 @@ def test_accelerations_are_within_physical_bounds(name: str) -> None:
 
 
 def test_hard_braking_is_rare(name: str) -> None:
-    rates = np.concatenate([step.states[:, 1] for step in minute(name)])
+    rates = np.concatenate([step.states[:, 1] for step in a_while(name)])
     assert (rates < -4.0).mean() < 0.005
 
 
 def test_vehicles_and_cyclists_stay_on_the_map(name: str) -> None:
     raster = made(name).raster
     layers: Layers = decode_layers(raster.image, raster.rows, raster.columns)
-    for step in minute(name):
+    for step in a_while(name):
         corners = step.corners[step.kinds != "pedestrian"]
         pixels = np.round((corners - (raster.origin_x, raster.origin_y)) * raster.pixels_per_meter)
         rows, columns = np.moveaxis(pixels.astype(int), -1, 0)
@@ -143,12 +143,12 @@ def test_vehicles_and_cyclists_stay_on_the_map(name: str) -> None:
 
 def test_users_enter_leave_and_do_not_stand_forever(name: str) -> None:
     world = made(name)
-    first, last = ({user.name for user in step.users} for step in (minute(name)[0], minute(name)[-1]))
+    first, last = ({user.name for user in step.users} for step in (a_while(name)[0], a_while(name)[-1]))
     assert last - first
     assert first - last
     usual = sum(world.population.values())
-    assert all(0.5 * usual < len(step.users) <= usual for step in minute(name))
-    for step in minute(name):
+    assert all(0.5 * usual < len(step.users) <= usual for step in a_while(name))
+    for step in a_while(name):
         for route, waits in zip(step.routes, step.states[:, 3].tolist(), strict=True):
             assert waits < 70.0 or world.routes[route].stops
 
@@ -165,7 +165,7 @@ def test_a_seed_repeats_and_another_differs() -> None:
 
 
 def test_everything_happens_at_the_junction() -> None:
-    assert {event for step in minute("junction") for event in step.events} >= {
+    assert {event for step in a_while("junction") for event in step.events} >= {
         "vehicle waits at red",
         "pedestrian waits at red",
         "vehicle yields",
@@ -180,7 +180,7 @@ def test_everything_happens_at_the_junction() -> None:
 
 def test_vehicles_change_lanes_on_the_motorway() -> None:
     routes: dict[str, set[str]] = {}
-    for step in minute("highway"):
+    for step in a_while("highway"):
         for user, route in zip(step.users, step.routes, strict=True):
             routes.setdefault(user.name, set()).add(route)
     changed = [taken for taken in routes.values() if len(taken) > 1]
