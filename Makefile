@@ -32,7 +32,7 @@ test: install lint proto-check  ## lint, check types and generated code, run all
 	$(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist loadfile
 
 test-system: install  ## replicas behind HAProxy, the console (apt-get install haproxy prometheus chromium npm); needs redis-server
-	$(BIN)/python -m pytest -m system tests/system tests/service/console
+	$(BIN)/python -m pytest -m system tests/system tests/service/console tests/examples
 
 # nuscenes-devkit needs numpy < 2, so it has its own environment, with all other pins of constraints.txt.
 $(NUSCENES)/.installed: pyproject.toml constraints.txt
