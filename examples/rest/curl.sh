@@ -59,7 +59,8 @@ scene_at "$now" 2.2 | request /v1/predict -H 'Content-Type: application/json' --
   --write-out '\n{"http_status": %{http_code}, "content_type": "%{content_type}"}\n' | pretty
 
 echo "== Live forecasts of the scene"
-request "/v1/scenes/$scene/forecasts/watch" --no-buffer >"$events" &
+curl --silent --no-buffer --max-time 20 ${CAB_FORECAST_TOKEN:+-H "Authorization: Bearer $CAB_FORECAST_TOKEN"} \
+  "$url/v1/scenes/$scene/forecasts/watch" >"$events" &
 watcher=$!
 tries=0
 until [ -s "$events" ] || [ "$tries" -ge 50 ]; do # the first message says that the watch has begun
