@@ -24,7 +24,8 @@ def response() -> PredictResponse:
 def test_shapes_and_values(response: PredictResponse) -> None:
     views = forecasts(response)
     assert list(views) == [entry.agent_id for entry in response.forecasts]
-    view, entry, K, T = views["car-left-turn"], response.forecasts[2], len(TURN_RATES), 12
+    entry, K, T = response.forecasts[2], len(TURN_RATES), 12
+    view = views[entry.agent_id]
     assert (view.status, view.model, view.history_frames) == (Status.OK, MODEL, 5)
     assert view.means.shape == (K, T, 2)
     assert view.covariances.shape == (K, T, 2, 2)
@@ -51,34 +52,34 @@ def test_an_invalid_agent_has_no_forecast(response: PredictResponse) -> None:
 
 
 def test_a_second_report_on_an_id_does_not_hide_the_first(response: PredictResponse) -> None:
-    response.forecasts.add(agent_id="cyclist", status=FORECAST_STATUS_INVALID)
-    assert forecasts(response)["cyclist"].status is Status.OK
+    response.forecasts.add(agent_id="cyclist-10", status=FORECAST_STATUS_INVALID)
+    assert forecasts(response)["cyclist-10"].status is Status.OK
 
 
 def test_a_status_of_the_future(response: PredictResponse) -> None:
     response.forecasts[0].status = 99  # type: ignore[assignment]
-    assert forecasts(response)["car-straight"].status is Status.UNSPECIFIED
+    assert forecasts(response)["vehicle-3"].status is Status.UNSPECIFIED
 
 
 def test_warnings_of_the_input(response: PredictResponse) -> None:
-    assert forecasts(response)["car-straight"].warnings == ()
+    assert forecasts(response)["vehicle-3"].warnings == ()
     entry = response.forecasts[0]
     entry.warnings.add(code=INPUT_WARNING_CODE_TIME_UNIT, detail="in ns?", field="agents[0].states[1].time")
     entry.warnings.add(code=99)
-    first, unknown = forecasts(response)["car-straight"].warnings
+    first, unknown = forecasts(response)["vehicle-3"].warnings
     assert first == InputWarning("TIME_UNIT", "in ns?", "agents[0].states[1].time")
     assert unknown.code == "UNSPECIFIED"
 
 
 def test_tracking_and_consistency(response: PredictResponse) -> None:
     entry = response.forecasts[0]
-    view = forecasts(response)["car-straight"]
+    view = forecasts(response)["vehicle-3"]
     assert (view.tracking, view.consistency) == (Tracking.UNSPECIFIED, None)
     assert tracking(response) is Tracking.UNSPECIFIED
     response.tracking = TRACKING_STATUS_UNAVAILABLE
     entry.tracking = TRACKING_STATUS_RESET
     entry.consistency.time = 2.5
-    view = forecasts(response)["car-straight"]
+    view = forecasts(response)["vehicle-3"]
     assert view.tracking is Tracking.RESET
     assert view.consistency is not None
     assert view.consistency.time == 2.5
@@ -94,7 +95,7 @@ def test_no_agents() -> None:
 @pytest.mark.parametrize("name", ["means", "covariances", "mode_ids", "samples"])
 def test_contradicting_sizes_are_refused(response: PredictResponse, name: str) -> None:
     getattr(response.forecasts[0], name).append(1)
-    with pytest.raises(ValueError, match="'car-straight'"):
+    with pytest.raises(ValueError, match="'vehicle-3'"):
         forecasts(response)
 
 

@@ -1,6 +1,7 @@
 """The client against the real server, on free ports."""
 
 import asyncio
+import math
 from collections.abc import Iterator
 from importlib import metadata
 from typing import Any
@@ -80,7 +81,14 @@ def test_forecasts_the_demo(arguments: dict[str, Any]) -> None:
         assert view.status in (Status.OK, Status.SHORT_HISTORY)
         assert view.weights.sum() + view.remaining_weight == pytest.approx(1.0)
         assert (np.linalg.eigvalsh(view.covariances) > 0).all()
-    np.testing.assert_allclose(views["car-straight"].most_likely[-1], [67.0, -5.25], atol=0.5)
+    now = request.agents[0].states[-1]
+    ahead = (
+        6
+        * math.hypot(now.velocity_x, now.velocity_y)
+        * np.array([math.cos(now.heading), math.sin(now.heading)])
+    )
+    assert math.hypot(*ahead) > 5
+    np.testing.assert_allclose(views["vehicle-3"].most_likely[-1], np.array([now.x, now.y]) + ahead, atol=0.5)
 
 
 def test_samples_are_repeatable(arguments: dict[str, Any]) -> None:
@@ -88,14 +96,14 @@ def test_samples_are_repeatable(arguments: dict[str, Any]) -> None:
     request.options.samples, request.options.seed = 4, 11
     with Client(**arguments) as client:
         first, second = (forecasts(client.predict(request)) for _ in range(2))
-    assert first["cyclist"].samples.shape == (4, 12, 2)
-    np.testing.assert_array_equal(first["cyclist"].samples, second["cyclist"].samples)
+    assert first["cyclist-10"].samples.shape == (4, 12, 2)
+    np.testing.assert_array_equal(first["cyclist-10"].samples, second["cyclist-10"].samples)
 
 
 async def test_asyncio(arguments: dict[str, Any]) -> None:
     async with AsyncClient(**arguments) as client:
         responses = await asyncio.gather(*(client.predict(demo_request()) for _ in range(4)))
-    assert len({forecasts(response)["cyclist"].most_likely.tobytes() for response in responses}) == 1
+    assert len({forecasts(response)["cyclist-10"].most_likely.tobytes() for response in responses}) == 1
 
 
 def test_models(arguments: dict[str, Any]) -> None:
@@ -121,12 +129,12 @@ def test_consistency(arguments: dict[str, Any]) -> None:
             assert tracking(client.predict(request)) is not Tracking.UNAVAILABLE
             event = next(events)
         response = client.predict(request)
-        view = forecasts(response)["cyclist"]
+        view = forecasts(response)["cyclist-10"]
         assert (tracking(response), view.tracking) == (Tracking.OK, Tracking.OK)
         ids = {agent.id for agent in request.agents}
         assert {instant.agent_id for instant in event.instants} == ids
         assert {instant.agent_id for instant in client.scene_consistency("demo").latest} == ids
-        assert client.agent_consistency("demo", "cyclist")[-1].time == request.time
+        assert client.agent_consistency("demo", "cyclist-10")[-1].time == request.time
         assert client.model_consistency() == []  # nothing settled yet
         assert client.reset_scene("demo") == len(ids)
 

@@ -16,6 +16,8 @@ from tests.cab_forecast.answers import answer
 from tests.cab_forecast.fakes import Failure, Script, grpc_fake
 from tests.service.recording.calls import folder_at
 
+AGENTS = len(demo_request().agents)
+
 run = CliRunner().invoke
 
 
@@ -55,7 +57,9 @@ def test_equal_answers_end_with_zero(tmp_path: Path, script: Script) -> None:
     file = record(tmp_path, shifted(0.0), shifted(0.0))
     result = run(app, ["replay", file])
     assert result.exit_code == 0, result.output
-    assert result.stdout.startswith("2 calls, 22 forecasts: 0 calls differ by more than 0.0001; at most 0 m")
+    assert result.stdout.startswith(
+        f"2 calls, {2 * AGENTS} forecasts: 0 calls differ by more than 0.0001; at most 0 m"
+    )
     assert [request.model for request in script.predicted] == ["fan@1.0.0"] * 2
     assert run(app, ["replay", file, "--limit", "1", "--model", "kalman"]).exit_code == 0
     assert [request.model for request in script.predicted[2:]] == ["kalman"]
@@ -77,7 +81,7 @@ def test_json_has_a_line_for_each_call(tmp_path: Path) -> None:
     assert result.exit_code == 1
     calls = [json.loads(line) for line in result.stdout.splitlines()]
     assert [call["position_m"] for call in calls] == [0.0, pytest.approx(18**0.5)]
-    assert calls[0]["agents"] == 11
+    assert calls[0]["agents"] == AGENTS
 
 
 def test_a_refused_call_is_a_difference(tmp_path: Path, script: Script) -> None:
@@ -85,7 +89,7 @@ def test_a_refused_call_is_a_difference(tmp_path: Path, script: Script) -> None:
     result = run(app, ["replay", record(tmp_path, shifted(0.0), shifted(0.0))])
     assert result.exit_code == 1
     assert "not so" in result.stdout.splitlines()[0]
-    assert "2 calls, 11 forecasts" in result.stdout
+    assert f"2 calls, {AGENTS} forecasts" in result.stdout
 
 
 def test_faults_are_said_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

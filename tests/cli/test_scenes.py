@@ -46,4 +46,8 @@ def test_scenes_are_listed(server: Server, scheme: str) -> None:
     assert "demo" in table.output
     assert "kalman@1.0.0" in table.output
     [scene] = json.loads(run(app, ["scenes", endpoint, "--json"]).output)["scenes"]
-    assert (scene["scene_id"], scene["agents"], scene["model"]["name"]) == ("demo", 11, "kalman")
+    assert (scene["scene_id"], scene["agents"], scene["model"]["name"]) == (
+        "demo",
+        len(demo_request().agents),
+        "kalman",
+    )

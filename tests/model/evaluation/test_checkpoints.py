@@ -119,5 +119,6 @@ def test_caches_are_made_once(tmp_path: Path, models: tuple[Learned, ...]) -> No
     said: list[str] = []
     for _ in range(2):
         list(open_validations(models, tmp_path, READER, "made", "some", Protocol.CAUSAL, said.append))
-    assert len(said) == 1
-    assert "made-48168fa9-some-causal-5-vp" in said[0]
+    assert len(said) == 2
+    assert said[0].startswith("The cache of some does not exist yet")
+    assert "from 2 scenes built" in said[1]

@@ -298,7 +298,9 @@ async def test_a_call_over_grpc_is_refused_before_its_request_is_read() -> None:
         fake.free.clear()
         accepted = [asyncio.create_task(call_grpc(server, make_request(4)))]
         await until(fake.entered.is_set)
-        accepted.append(asyncio.create_task(call_grpc(server, make_request(4))))
+        for _ in range(2):  # one that the thread of the forward is given ahead, and one that fills the queue
+            accepted.append(asyncio.create_task(call_grpc(server, make_request(4))))
+            await asyncio.sleep(0.3)
         await until_waiting(server, 4)
         async with connected(server.grpc_address, [grpc_call(1000, body=b"the rest never comes")]):
             await until(lambda: count(server, "grpc", "Predict", "RESOURCE_EXHAUSTED") == 1)
