@@ -41,7 +41,8 @@ def test_every_table_says_what_it_is_of() -> None:
     statement = "causal protocol, made split some, the first 10 pairs only, seed 3"
     assert all(statement in table.note for table in made)
     [reason] = left_out(results)
-    assert reason.startswith("10. What the forecasts owe") and reason.endswith("(--explain)")
+    assert reason.startswith("10. What the forecasts owe")
+    assert reason.endswith("(--explain)")
     assert markdown(results).count(statement) == 1 + len(made)
 
 
