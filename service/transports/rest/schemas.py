@@ -213,7 +213,9 @@ def _message(descriptor: Descriptor, is_request: bool, limits: dict[str, Schema]
         schema["required"] = required
     choices = [oneof for oneof in descriptor.oneofs if not oneof.name.startswith("_")]
     if choices:
-        schema["oneOf"] = [{"required": [field.name]} for oneof in choices for field in oneof.fields]
+        some = [{"required": [field.name]} for oneof in choices for field in oneof.fields]
+        # The first message of a stream and its heartbeats hold nothing
+        schema["oneOf"] = some if is_request else [*some, {"not": {"anyOf": some}}]
     return schema
 
 

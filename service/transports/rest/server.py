@@ -13,6 +13,7 @@ import uvicorn
 from fastapi import FastAPI
 from fastapi_offline import FastAPIOffline
 from starlette.applications import Starlette
+from starlette.convertors import PathConvertor, register_url_convertor
 from starlette.exceptions import HTTPException
 from starlette.middleware.cors import CORSMiddleware
 from starlette.requests import Request
@@ -45,6 +46,15 @@ _POLL = 0.005
 _MIN_GRACE = 0.1
 """Seconds. With a grace period of 0 uvicorn would skip the wait for open connections entirely."""
 _BACKLOG = 2048
+
+
+class _IdConvertor(PathConvertor):
+    """Text of any kind: ids may hold slashes, and line breaks, which Starlette's convertors do not match."""
+
+    regex = r"[\s\S]+"
+
+
+register_url_convertor("id", _IdConvertor())
 
 
 def build_app(
@@ -87,8 +97,7 @@ def build_app(
         )
     records = CallRecords("rest", metrics, settings, tracing)
     for route, endpoint in Endpoints(dataplane, records, settings, intake, gate).by_route().items():
-        # A scene's id may hold slashes
-        path = route.path.replace("{scene_id}", "{scene_id:path}")
+        path = route.path.replace("{scene_id}", "{scene_id:id}")
         app.add_route(path, endpoint, methods=[route.verb])
 
     async def show_metrics(request: Request) -> Response:

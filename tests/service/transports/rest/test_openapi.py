@@ -83,6 +83,9 @@ def test_schemas_have_the_messages_fields() -> None:
     assert SCHEMAS["AgentType"]["enum"][1] == "AGENT_TYPE_VEHICLE"
     assert SCHEMAS["Model"]["properties"]["benchmark"]["additionalProperties"]["type"] == "number"
     assert SCHEMAS["LayerImage"]["oneOf"] == [{"required": ["packed_bits"]}, {"required": ["png"]}]
+    assert {"not": {"anyOf": SCHEMAS["WatchForecastsResponse"]["oneOf"][:-1]}} in (
+        SCHEMAS["WatchForecastsResponse"]["oneOf"]
+    )
     whole, named = SCHEMAS["SceneRaster"]["anyOf"]
     assert named == {"required": ["digest"]}
     assert "image" in whole["required"]
