@@ -73,10 +73,12 @@ async def test_over_grpc_a_client_gets_a_new_connection_after_a_while_and_loses_
             watch = ConsistencyServiceStub(channel).WatchScene(WATCH)
             assert await watch.read() == BEGUN
             stub = ModelServiceStub(channel)
+            most = 0  # at any one moment the newer connection may be between two
             for _ in range(120):
                 assert (await stub.ListModels(ListModelsRequest())).models
+                most = max(most, established(server.grpc_address))
                 await asyncio.sleep(0.01)
-            assert established(server.grpc_address) >= 2, "the watch's connection and a newer one"
+            assert most >= 2, "the watch's connection and a newer one"
             watch.cancel()
 
 
