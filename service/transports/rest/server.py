@@ -51,7 +51,7 @@ _BACKLOG = 2048
 class _IdConvertor(PathConvertor):
     """Text of any kind: ids may hold slashes, and line breaks, which Starlette's convertors do not match."""
 
-    regex = r"[\s\S]+"
+    regex = r"[\s\S]*"
 
 
 register_url_convertor("id", _IdConvertor())
