@@ -42,7 +42,7 @@ class ExplanationSettings:
     pairs: int = 200
     """Maximum number of pairs, drawn at random."""
     baseline: Baseline = "donors"
-    """What stands for what is absent."""
+    """Stand-in for absent parts of a scene."""
 
 
 @dataclass(frozen=True)

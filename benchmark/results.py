@@ -85,7 +85,7 @@ class ExplanationRun:
     pairs: int
     """Number of pairs that were to be explained."""
     baseline: str
-    """What stood for absent parts: "donors", where they fit, or "null_context"."""
+    """Stand-in for absent parts: "donors", where they fit, or "null_context"."""
 
 
 @dataclass(frozen=True, kw_only=True)

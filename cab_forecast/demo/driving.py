@@ -1,4 +1,4 @@
-"""How road users accelerate, and how long their ways take.
+"""Accelerations of road users, and durations of their ways.
 
 Following is the intelligent driver model (Treiber, Hennecke and Helbing 2000, eq. 2), with a deceleration
 that stays comfortable above the desired speed.

@@ -73,7 +73,7 @@ def _driving(arm: int) -> list[Route]:
         for lane, aside in (("inner", _INNER), ("outer", _OUTER)):
             if (turn, lane) in (("left", "outer"), ("right", "inner")):
                 continue
-            # Of the western arm: eastwards, on the right
+            # The western arm leads eastwards, on the right
             way = polyline((-_END, -aside), (_END, -aside))
             if quarter:
                 out = quarter * aside  # the lane that it turns into

@@ -15,7 +15,7 @@ _LOST = 5.0
 
 @dataclass
 class Progress:
-    """What a demo has done in the last seconds."""
+    """Calls and failures of a demo in the last seconds."""
 
     calls: int = 0
     agents: int = 0

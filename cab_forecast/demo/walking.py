@@ -1,4 +1,4 @@
-"""How pedestrians whose ways cross make room for each other: the one who came later lets the other pass."""
+"""Right of way among pedestrians whose ways cross: the one who came later lets the other pass."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
