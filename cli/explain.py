@@ -10,19 +10,18 @@ import typer
 from cab.forecast.v1.bounds import MAX_DRAWS, MAX_PERMUTATIONS
 from cli.connection import AsJson, Connection, Timeout, connect, with_connection
 from cli.failures import fail
-from cli.predict import DEMO
+from cli.predict import DEMO, UINT32_MAX, Horizon, RequestFile
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from cab.forecast.v1.prediction_service_pb2 import PredictRequest
 
-_UINT32_MAX = 2**32 - 1
 _TIMEOUT = 60.0
 
 
 class AbsentPart(StrEnum):
-    """What stands for a part that is absent."""
+    """Stand-in for a part that is absent."""
 
     DONORS = "donors"
     NULL_CONTEXT = "null-context"
@@ -34,13 +33,7 @@ def register(app: typer.Typer) -> None:
 
 
 def explain(
-    request_file: Annotated[
-        str,
-        typer.Argument(
-            metavar="FILE",
-            help="A PredictRequest as .json or .binpb, - for standard input, or demo for a bundled crossing.",
-        ),
-    ],
+    request_file: RequestFile,
     *,
     connection: Connection,
     timeout: Timeout = _TIMEOUT,
@@ -60,8 +53,8 @@ def explain(
         int,
         typer.Option(min=0, max=MAX_PERMUTATIONS, help="Orders of more than six neighbours, even; 0: 16."),
     ] = 0,
-    seed: Annotated[int, typer.Option(min=0, max=_UINT32_MAX, help="Seed of the draws.")] = 0,
-    horizon: Annotated[float | None, typer.Option(help="Seconds ahead, a multiple of 0.5.")] = None,
+    seed: Annotated[int, typer.Option(min=0, max=UINT32_MAX, help="Seed of the draws.")] = 0,
+    horizon: Horizon = None,
     plot: Annotated[
         Path | None,
         typer.Option(dir_okay=False, help="Plot bars beside the forecasts to a .png, .svg or .pdf file."),

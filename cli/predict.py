@@ -15,7 +15,15 @@ if TYPE_CHECKING:
 
 DEMO = "demo"
 """The file name that stands for the bundled crossing."""
-_UINT32_MAX = 2**32 - 1
+UINT32_MAX = 2**32 - 1
+RequestFile = Annotated[
+    str,
+    typer.Argument(
+        metavar="FILE",
+        help="A PredictRequest as .json or .binpb, - for standard input, or demo for a bundled crossing.",
+    ),
+]
+Horizon = Annotated[float | None, typer.Option(help="Seconds ahead, a multiple of 0.5.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -24,24 +32,18 @@ def register(app: typer.Typer) -> None:
 
 
 def predict(
-    request_file: Annotated[
-        str,
-        typer.Argument(
-            metavar="FILE",
-            help="A PredictRequest as .json or .binpb, - for standard input, or demo for a bundled crossing.",
-        ),
-    ],
+    request_file: RequestFile,
     *,
     connection: Connection,
     timeout: Timeout = DEFAULT_TIMEOUT,
     model: Annotated[str | None, typer.Option(help="name or name@version.")] = None,
     samples: Annotated[
-        int | None, typer.Option(min=0, max=_UINT32_MAX, help="Sampled trajectories per agent.")
+        int | None, typer.Option(min=0, max=UINT32_MAX, help="Sampled trajectories per agent.")
     ] = None,
-    seed: Annotated[int | None, typer.Option(min=0, max=_UINT32_MAX, help="Seed of the samples.")] = None,
-    horizon: Annotated[float | None, typer.Option(help="Seconds ahead, a multiple of 0.5.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, max=UINT32_MAX, help="Seed of the samples.")] = None,
+    horizon: Horizon = None,
     max_modes: Annotated[
-        int | None, typer.Option(min=0, max=_UINT32_MAX, help="Return the likeliest modes only; 0: all.")
+        int | None, typer.Option(min=0, max=UINT32_MAX, help="Return the likeliest modes only; 0: all.")
     ] = None,
     all_modes: Annotated[
         bool, typer.Option("--all-modes", help="Return the model's own modes, without merging similar ones.")
