@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from model.arrays import Floats
+from model.arrays import Floats, Ints
 from model.data.cache import Cache
 from model.data.cache_layout import (
     FILE_NAMES,
@@ -216,14 +216,13 @@ def _agent_frame_arrays(
     recorded = SceneFrames(record, protocol, history_frames)
     sensed = SensedFrames(record, history_frames, seed=zlib.crc32(record.name.encode()))
     identity = _identity(record, scene)
-    frame, track = identity["frame"], identity["track"]
     rows = 1 + variants
     parts: list[Arrays] = []
-    for now in np.unique(frame):  # pairs are sorted by frame, too
+    for now, wanted in _by_frame(identity):
         reports = []
         for variant in range(rows):
-            seen, tracks = sensed.at(int(now), variant) if variant else recorded.at(int(now))
-            targets = np.searchsorted(tracks, track[frame == now])
+            seen, tracks = sensed.at(now, variant) if variant else recorded.at(now)
+            targets = np.searchsorted(tracks, wanted)
             report = agent_frame_features(seen, targets, network.features, Context.FULL)
             reports.append({name: tensor.numpy() for name, tensor in report.items()})
         part: Arrays = {  # [pairs · rows, …]
@@ -258,11 +257,10 @@ def _pair_arrays(
     """Return the rows of a scene's pairs in the ground frame, one a pair."""
     scenes = SceneFrames(record, protocol, history_frames)
     identity = _identity(record, scene)
-    frame, track = identity["frame"], identity["track"]
     parts: list[Arrays] = []
-    for now in np.unique(frame):  # pairs are sorted by frame, too
-        seen, tracks = scenes.at(int(now))
-        targets = np.searchsorted(tracks, track[frame == now])
+    for now, wanted in _by_frame(identity):
+        seen, tracks = scenes.at(now)
+        targets = np.searchsorted(tracks, wanted)
         features = network_features(seen, targets, AgentType.VEHICLE, config.features, Context.FULL)
         part: Arrays = {name: tensor.numpy() for name, tensor in features.items()}
         part["position"] = part.pop("origin")
@@ -272,6 +270,13 @@ def _pair_arrays(
     future, turn = _paths(record, history_frames)
     arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     return arrays | identity | {"future": future, "turn": turn}
+
+
+def _by_frame(identity: Arrays) -> Iterator[tuple[int, Ints]]:
+    """Yield each frame that has pairs, and the tracks of its pairs; pairs are sorted by frame, too."""
+    frame, track = identity["frame"], identity["track"]
+    for now in np.unique(frame):
+        yield int(now), track[frame == now]
 
 
 def _identity(record: SceneRecord, scene: int) -> Arrays:
