@@ -34,10 +34,10 @@ test: install lint proto-check  ## lint, check types and generated code, run all
 test-system: install  ## replicas behind HAProxy, the console (apt-get install haproxy prometheus chromium npm); needs redis-server
 	$(BIN)/python -m pytest -m system tests/system tests/service/console tests/examples
 
-# nuscenes-devkit needs numpy < 2, so it has its own environment, with all other pins of constraints.txt.
+# nuscenes-devkit needs numpy < 2 and shapely 2.0, so it has its own environment, with all other pins of constraints.txt.
 $(NUSCENES)/.installed: pyproject.toml constraints.txt
 	test -x $(NUSCENES)/bin/python || $(PYTHON) -m venv $(NUSCENES)
-	grep -v '^numpy==' constraints.txt > $(NUSCENES)/constraints.txt
+	grep -vE '^(numpy|shapely)==' constraints.txt > $(NUSCENES)/constraints.txt
 	$(NUSCENES)/bin/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS) \
 	  -c $(NUSCENES)/constraints.txt -e ".[benchmark,dev]"
 	touch $@
