@@ -318,13 +318,23 @@ class MapEncoder(nn.Module):
         )
         self.project = nn.Linear(48 * 5 * 5, _WIDTH)
         self.dropout = nn.Dropout(dropout)
+        self.training_dtype = torch.float32
+        """Type of the convolutions in training."""
 
     def forward(self, patches: Tensor) -> Tensor:
         patches = patches.contiguous(memory_format=torch.channels_last)
-        for conv in self.convs:
-            patches = F.relu(conv(patches), inplace=True)
+        if self.training and self.training_dtype is not torch.float32:
+            with torch.autocast(patches.device.type, self.training_dtype):
+                patches = self._convolved(patches).to(self.project.weight.dtype)
+        else:
+            patches = self._convolved(patches)
         encoded: Tensor = self.dropout(F.relu(self.project(patches.flatten(1))))
         return encoded
+
+    def _convolved(self, patches: Tensor) -> Tensor:
+        for conv in self.convs:
+            patches = F.relu(conv(patches), inplace=True)
+        return patches
 
 
 def _neighbors(features: Features, full: bool) -> tuple[Tensor, Tensor]:

@@ -11,6 +11,7 @@ from model.data.packing import unpack_patches
 from model.data.perturbation import drop_context, insert_stopped_vehicles, jitter
 from model.forecaster import Features
 from model.networks.agent_frame import AgentFrameNetwork
+from model.networks.agent_frame import MapEncoder as PatchEncoder
 from model.networks.config import NetworkConfig
 from model.networks.covernet import turned
 from model.networks.cvae import AgentNetwork
@@ -201,7 +202,7 @@ def logged(loss: Loss) -> dict[str, Tensor]:
 def set_precision(networks: nn.Module, dtype: torch.dtype) -> None:
     """Set the training precision of every decoder and map encoder."""
     for module in networks.modules():
-        if isinstance(module, ModeDecoder | MapEncoder):
+        if isinstance(module, ModeDecoder | MapEncoder | PatchEncoder):
             module.training_dtype = dtype
 
 

@@ -154,8 +154,12 @@ def _meets_standing(path: Path, future: Tensor, neighbors: Tensor) -> Tensor:
     left = drives_through(truth, neighbors) > _LEFT
     speed = NEIGHBOR_VELOCITY_SCALE * neighbors[..., 4:6].norm(dim=-1)
     stands = (neighbors[..., -1] > 0) & (speed < _STANDING_MPS) & ~left[:, 0]
-    met: Tensor = (drives_through(path, neighbors) * stands[:, None]).amax(dim=-1)
-    return met
+    # Few neighbours stand, so each of them is compared with its agent's modes alone
+    agent, neighbor = stands.nonzero(as_tuple=True)
+    paths = Path(*(part[agent] for part in path))
+    through = drives_through(paths, neighbors[agent, neighbor][:, None])[..., 0]  # [standing, K]
+    met = path.x.new_zeros(path.x.shape[:2])
+    return met.scatter_reduce(0, agent[:, None].expand_as(through), through, "amax")
 
 
 def step_log_density(network: AgentFrameNetwork, modes: Modes, future: Tensor) -> Tensor:
