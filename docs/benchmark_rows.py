@@ -1,0 +1,143 @@
+"""Rows of the benchmark figures in docs/data: ``python -m docs.benchmark_rows CAUSAL/results.json …``.
+
+Each file is the results of ``cab-forecast benchmark`` on train_val. Rows of its models replace those of the
+same name and protocol; all others stay. ``make docs`` then renews the tables.
+"""
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from docs.generate import BENCHMARK, Row
+
+Metrics = Mapping[str, float | None]
+
+
+def displacement_row(metrics: Metrics) -> Row:
+    """Return the figures of one model in a table of displacement errors."""
+    return {
+        "ade": [_number(metrics, f"ade_ml_{second}s_m") for second in range(1, 7)],
+        "fde": [_number(metrics, f"fde_ml_{second}s_m") for second in range(1, 7)],
+        "off_road": _number(metrics, "off_road_ml"),
+        "nll": _number(metrics, "nll"),
+        "min_ade_10": _number(metrics, "min_ade_10_m"),
+        "inside_50_90_99": _all_or_none([_percent(metrics, f"inside_{share}") for share in (50, 90, 99)]),
+        "sampled_fde": _number(metrics, "fde_f_6s_m"),
+        "sampled_off_road": _number(metrics, "off_road_f"),
+    }
+
+
+def merged_row(metrics: Metrics) -> Row:
+    """Return the figures of one model in the table of merged modes; pairs: all, without standing agents."""
+    return {
+        "fde": _with_moving(metrics, "fde_ml_6s_m"),
+        "fde_merged": _with_moving(metrics, "fde_merged_6s_m"),
+        "min_ade_5_10": [_number(metrics, f"min_ade_{count}_m") for count in (5, 10)],
+        "min_ade_5_10_merged": [_number(metrics, f"merged_min_ade_{count}_m") for count in (5, 10)],
+        "miss_rate_5": _number(metrics, "miss_rate_5"),
+        "miss_rate_5_merged": _number(metrics, "merged_miss_rate_5"),
+        "brier_min_fde_5_merged": _number(metrics, "merged_brier_min_fde_5_m"),
+        "merged_modes_for_90": _number(metrics, "merged_modes_90"),
+        "first_weight": _number(metrics, "merged_first_weight"),
+        "nll": _with_moving(metrics, "nll"),
+        "inside_90": [_percent(metrics, "inside_90"), _percent(metrics, "moving_inside_90")],
+    }
+
+
+def consistency_row(metrics: Metrics) -> Row:
+    """Return the figures of one model in the table of dispersion, convergence-to-range and hard cases."""
+    return {
+        **{f"dispersion_{kind}": _number(metrics, f"dispersion_{kind}_m") for kind in ("std", "mean", "rms")},
+        "convergence_02": _number(metrics, "convergence_0.2m_s"),
+        "convergence_1": _number(metrics, "convergence_1m_s"),
+        "convergence_5": _number(metrics, "convergence_5m_s"),
+        "hardest_fde_1_2_3": [_number(metrics, f"fde_hardest_{share}_m", 1) for share in (1, 2, 3)],
+    }
+
+
+def with_results(data: dict[str, list[Row]], results: Mapping[str, Any]) -> dict[str, list[Row]]:
+    """Return the data with the rows of a benchmark's models in place of those of the same names.
+
+    Args:
+        data: rows by table.
+        results: contents of a benchmark's ``results.json``.
+
+    Raises:
+        ValueError: the results are of a part of the pairs, or of another split than train_val.
+    """
+    if results["split"] != "train_val" or results["limit"] is not None:
+        raise ValueError("the tables hold figures of the whole of train_val")
+    protocol = results["protocol"]
+    made: dict[str, Callable[[Metrics], Row]] = {f"displacement_{protocol}": displacement_row}
+    if protocol == "causal":
+        made |= {"merged_causal": merged_row, "consistency_causal": consistency_row}
+    renewed = {table: {row["model"]: row for row in rows} for table, rows in data.items()}
+    labels = _labels(results["models"])
+    for model, label in zip(results["models"], labels, strict=True):
+        if model["protocol"] not in ("any", protocol):
+            continue
+        for table, make in made.items():
+            row = {"model": label, **make(model["metrics"])}
+            whole = table != "merged_causal" or (row["fde_merged"][0] is not None and model["protocol"] != "any")
+            if whole:
+                renewed[table][label] = row
+    return {table: list(rows.values()) for table, rows in renewed.items()}
+
+
+def _labels(models: list[Mapping[str, Any]]) -> list[str]:
+    """Return the names of models in tables; of several versions all but the newest have theirs behind."""
+    newest: dict[str, tuple[int, ...]] = {}
+    for model in models:
+        newest[model["name"]] = max(newest.get(model["name"], ()), _version(model["version"]))
+    return [
+        model["name"]
+        if _version(model["version"]) == newest[model["name"]]
+        else f"{model['name']} {model['version']}"
+        for model in models
+    ]
+
+
+def _version(text: str) -> tuple[int, ...]:
+    return tuple(int(part) for part in text.partition("+")[0].split("."))
+
+
+def _number(metrics: Metrics, name: str, digits: int = 2) -> float | None:
+    value = metrics.get(name)
+    return None if value is None or math.isnan(value) else round(value, digits)
+
+
+def _percent(metrics: Metrics, name: str) -> int | None:
+    value = metrics.get(name)
+    return None if value is None or math.isnan(value) else round(100 * value)
+
+
+def _with_moving(metrics: Metrics, name: str) -> list[float | None]:
+    return [_number(metrics, name), _number(metrics, f"moving_{name}")]
+
+
+def _all_or_none(values: list[int | None]) -> list[int | None] | None:
+    return None if None in values else values
+
+
+def main(
+    results: Annotated[list[Path], typer.Argument(help="results.json of benchmarks on train_val")],
+) -> None:
+    """Renew the rows of the models of each results file in ``docs/data``."""
+    data = json.loads(BENCHMARK.read_text(encoding="utf-8"))
+    for file in results:
+        data = with_results(data, json.loads(file.read_text(encoding="utf-8")))
+    tables = [
+        f"  {json.dumps(table)}: [\n"
+        + ",\n".join(f"    {json.dumps(row)}" for row in rows)
+        + "\n  ]"
+        for table, rows in data.items()
+    ]
+    BENCHMARK.write_text("{\n" + ",\n".join(tables) + "\n}\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    typer.run(main)
