@@ -8,7 +8,11 @@ import torch
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Give each of several test processes one thread: more would wait for each other's cores."""
+    """Give each of several test processes one thread: more would wait for each other's cores.
+
+    Servers have no worker processes, whose start takes seconds, unless the environment or a test says so.
+    """
+    os.environ.setdefault("FORECAST_WORKERS", "0")
     if hasattr(config, "workerinput"):
         torch.set_num_threads(1)
 

@@ -97,6 +97,11 @@ class NetworkForecaster(Forecaster, Generic[SomeNetworks]):
             return False
         return True
 
+    @property
+    def is_compiled(self) -> bool:
+        """True if forwards are native calls."""
+        return bool(self._graphs)
+
     def requires_heading(self, agent_type: AgentType) -> bool:
         """Return True for vehicles: a pedestrian's state has no heading, and it sees no map."""
         return agent_type is AgentType.VEHICLE

@@ -13,26 +13,26 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import structlog
 import torch
 
-from model.forecaster import Context, Forecaster, ModelInfo, Prepared, complete
+from model.forecaster import Context, Forecaster, Prepared
 from model.mixture import TrajectoryMixture
 from model.scenes.scene import AgentType
 from service.errors import DeadlineExceeded, Internal, Unavailable
 from service.predict.admission import Admission, Call
+from service.predict.forward import Forwarded, forward
 from service.predict.scheduler import MAX_BATCH_SECONDS, DeadlineQueue
 from service.predict.torch_threads import set_helper_threads
+from service.predict.workers import Worker
 from service.telemetry.metrics import Metrics
 
 _log = structlog.get_logger(__name__)
 
 _T = TypeVar("_T")
 
-_CUT_IN_THREADS = 8
-"""Agents of a batch from which on map patches are cut in several threads."""
 _MANY_AGENTS = 16
 """Agents in the queue from which on a forward starts beside another one in any case."""
 _AHEAD_SECONDS = 0.015
@@ -79,18 +79,6 @@ class Outcome:
     """Number of agents in its (largest) batch."""
     patches: float = 0.0
     """Seconds of ``inference`` before the network began, in which map patches were cut."""
-
-
-class _Forwarded(NamedTuple):
-    """Result of a forward, and its time."""
-
-    mixture: TrajectoryMixture
-    started: float
-    """Start by ``time.perf_counter``."""
-    seconds: float
-    """Duration."""
-    patches: float
-    """Seconds of these in which map patches were cut."""
 
 
 @dataclass(eq=False)
@@ -148,9 +136,20 @@ class _Batch:
 class _Slot:
     """Thread of forwards, and the batches that it was given: the one in the model, and perhaps the next."""
 
-    def __init__(self, number: int) -> None:
+    def __init__(self, number: int, worker: Worker | None = None) -> None:
         self.thread = ThreadPoolExecutor(1, thread_name_prefix=f"forward-{number}")
+        self.worker = worker
+        """Process in which the thread has forwards run; None: it runs them itself."""
         self.batches: list[_Batch] = []
+
+    def forward(
+        self, job: Job, parts: Sequence[Prepared], steps: int, width: int, cutters: Executor
+    ) -> "asyncio.Future[Forwarded]":
+        """Give a forward to the thread."""
+        run = forward if self.worker is None else self.worker.forward
+        return asyncio.get_running_loop().run_in_executor(
+            self.thread, run, job.forecaster, job.agent_type, job.context, parts, steps, width, cutters
+        )
 
     @property
     def until(self) -> float:
@@ -167,6 +166,7 @@ class Batcher:
         admission: Admission,
         metrics: Metrics,
         widths: Sequence[int] = (1,),
+        workers: int = 0,
     ) -> None:
         """
         Args:
@@ -175,6 +175,8 @@ class Batcher:
             metrics: the metrics that count batches.
             widths: number of torch threads of a forward that runs alone; if there is a second number, two
                 forwards may run at the same time, with so many each (``torch_threads.forward_widths``).
+            workers: number of processes that run forwards, as many at the same time; 0: threads of this
+                process run them.
         """
         self._max_batch = max_batch_agents
         self._admission = admission
@@ -183,7 +185,11 @@ class Batcher:
         self._queue: DeadlineQueue[_Entry] = DeadlineQueue(self._costs)
         self._wake = asyncio.Event()
         self._widths = tuple(widths)
-        self._slots = [_Slot(number) for number in range(len(widths))]
+        self._workers = [Worker(number, self._widths, metrics.worker_deaths.inc) for number in range(workers)]
+        self._slots = [_Slot(number, worker) for number, worker in enumerate(self._workers)] or [
+            _Slot(number) for number in range(len(widths))
+        ]
+        metrics.workers.set_function(lambda: sum(worker.is_ready for worker in self._workers))
         self._cutters = ThreadPoolExecutor(
             widths[0], thread_name_prefix="patches", initializer=set_helper_threads
         )
@@ -207,6 +213,11 @@ class Batcher:
         self._worker = asyncio.create_task(self._work(), name="batcher")
         self._worker.add_done_callback(self._check)
 
+    def start_workers(self, forecasters: Sequence[Forecaster]) -> None:
+        """Begin to start the processes, if there are any; until they have loaded the models, threads do."""
+        for worker in self._workers:
+            worker.start(forecasters)
+
     async def stop(self) -> None:
         """Fail the queued jobs, and wait for the batches that are in the model."""
         tasks = [task for task in (self._worker, *(batch.task for batch in self._batches)) if task]
@@ -217,6 +228,8 @@ class Batcher:
         self._queue.clear()
         for slot in self._slots:
             await asyncio.to_thread(slot.thread.shutdown)
+        for worker in self._workers:
+            await asyncio.to_thread(worker.close)
         self._cutters.shutdown()
 
     async def run(self, jobs: Sequence[Job], call: Call) -> list[Outcome]:
@@ -265,9 +278,12 @@ class Batcher:
             The seconds of the slowest forward.
         """
         slowest = 0.0
-        for slot, width in zip(self._slots, self._widths, strict=True):
+        for width in self._widths:
+            # Threads share what a forward allocates and compiles; processes do not
+            slots = self._slots if self._workers else self._slots[:1]
             if slowest < MAX_BATCH_SECONDS:
-                slowest = max(slowest, (await self._run_alone(job, slot, width)).inference)
+                for slot in slots:
+                    slowest = max(slowest, (await self._run_alone(job, slot, width)).inference)
         return slowest
 
     @property
@@ -300,15 +316,17 @@ class Batcher:
         return await self._run_alone(job, self._slots[-1], self._widths[-1], usual=False)
 
     async def _run_alone(self, job: Job, slot: _Slot, width: int, usual: bool = True) -> Outcome:
-        done = await asyncio.get_running_loop().run_in_executor(
-            slot.thread, _forward, job, [job.inputs], job.steps, width, self._cutters
-        )
+        done = await slot.forward(job, [job.inputs], job.steps, width, self._cutters)
         self._costs.measure(job.key, job.agents, done.seconds, usual=usual)
         return Outcome(done.mixture, 0.0, done.seconds, job.agents, done.patches)
 
     def forget(self, forecasters: Iterable[Forecaster]) -> None:
-        """Forget how long the forwards of models take that are gone."""
-        self._costs.forget({id(forecaster) for forecaster in forecasters})
+        """Forget models that are gone, and how long their forwards take."""
+        gone = {id(forecaster) for forecaster in forecasters}
+        self._costs.forget(gone)
+        for slot in self._slots:
+            if slot.worker is not None:
+                slot.thread.submit(slot.worker.forget, gone)
 
     async def call_in_model_thread(self, function: Callable[..., _T], *arguments: object) -> _T:
         """Call a function in a thread of the forward, past the queue."""
@@ -389,7 +407,7 @@ class Batcher:
         steps = max(entry.job.steps for entry in entries)
         parts = [entry.inputs for entry in entries]
         # Not in the task, which begins only after all that the event loop has to do now
-        running = loop.run_in_executor(slot.thread, _forward, job, parts, steps, width, self._cutters)
+        running = slot.forward(job, parts, steps, width, self._cutters)
         batch.task = asyncio.create_task(self._finish(slot, batch, running), name="forward")
         batch.task.add_done_callback(self._check)
 
@@ -398,7 +416,7 @@ class Batcher:
         ends = [slot.until for slot in self._slots]
         self._admission.busy_until = min(ends) or None
 
-    async def _finish(self, slot: _Slot, batch: _Batch, running: "asyncio.Future[_Forwarded]") -> None:
+    async def _finish(self, slot: _Slot, batch: _Batch, running: "asyncio.Future[Forwarded]") -> None:
         """Deliver a batch once its forward is done."""
         try:
             done = await asyncio.shield(running)
@@ -454,7 +472,7 @@ class Batcher:
             self._admission.release(entry.call, entry.agents)
         return batch
 
-    def _deliver(self, batch: Sequence[_Entry], done: _Forwarded) -> None:
+    def _deliver(self, batch: Sequence[_Entry], done: Forwarded) -> None:
         agents = len(done.mixture)
         position = 0
         for entry in batch:
@@ -470,64 +488,13 @@ class Batcher:
             if not entry.done.done():
                 entry.done.set_exception(type(error)(error.detail))
 
-    def _measure(self, batch: _Batch, done: _Forwarded) -> None:
+    def _measure(self, batch: _Batch, done: Forwarded) -> None:
         first = batch.entries[0]
         self._costs.measure(first.key, batch.agents, done.seconds)
         self._metrics.batch_agents.observe(batch.agents)
         self._metrics.inference.labels(first.job.forecaster.info.name).observe(done.seconds)
         for entry in batch.entries:
             self._metrics.queue.observe(done.started - entry.queued)
-
-
-def _forward(job: Job, parts: Sequence[Prepared], steps: int, width: int, cutters: Executor) -> _Forwarded:
-    """Run one forward of the job's forecaster over the joined parts.
-
-    Args:
-        job: a job of the batch.
-        parts: the agents of the batch.
-        steps: number of steps.
-        width: number of threads of the forward.
-        cutters: threads that cut map patches; with one thread the forward's own cuts them.
-
-    Returns:
-        The mixture and the time that it took.
-
-    Raises:
-        RuntimeError: the mixture is not one of the expected agents, modes and steps.
-    """
-    started = time.perf_counter()
-    if torch.get_num_threads() != width:
-        torch.set_num_threads(width)
-    with torch.inference_mode():
-        agents = sum(map(len, parts))
-        features = complete(parts, cutters if width > 1 and agents >= _CUT_IN_THREADS else None)
-        patches = time.perf_counter() - started
-        mixture = job.forecaster.forecast(features, job.agent_type, job.context, steps)
-    require_shapes(job.forecaster.info, mixture, agents, steps)
-    return _Forwarded(mixture, started, time.perf_counter() - started, patches)
-
-
-def require_shapes(info: ModelInfo, mixture: TrajectoryMixture, agents: int, steps: int) -> None:
-    """Refuse a mixture of unexpected shapes.
-
-    Args:
-        info: the model that returned it.
-        mixture: the mixture.
-        agents: number of agents it must have.
-        steps: number of steps it must have.
-
-    Raises:
-        RuntimeError: the mixture is not one of these agents and steps and the model's modes.
-    """
-    modes = info.modes
-    expected = ((agents, modes), (agents, modes, steps, 2), (agents, modes, steps, 2, 2), (agents, 2))
-    tensors = (mixture.log_weights, mixture.means, mixture.covariances, mixture.origin)
-    shapes = tuple(tuple(tensor.shape) for tensor in tensors)
-    if shapes != expected:
-        raise RuntimeError(
-            f"{info.name} must forecast {agents} agents with {modes} modes of {steps} steps, but its "
-            f"log-weights, means, covariances and origins are of the shapes {shapes}"
-        )
 
 
 def _cut(mixture: TrajectoryMixture, steps: int) -> TrajectoryMixture:

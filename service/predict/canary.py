@@ -11,8 +11,7 @@ import torch
 from model.forecaster import Forecaster
 from model.mixture import TrajectoryMixture
 from model.scenes.scene import STEP_SECONDS, AgentStates, AgentType, Raster, Scene
-from service.predict.batcher import require_shapes
-from service.predict.plan import finite
+from service.predict.forward import finite, require_shapes
 
 _SPEEDS = {AgentType.PEDESTRIAN: 1.4}
 """m/s of the agent that moves, by its type."""

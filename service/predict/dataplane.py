@@ -22,7 +22,7 @@ from service.predict.rasters.library import RasterLibrary
 from service.predict.rasters.shared import SharedRasters
 from service.predict.reload import Load, Reloader
 from service.predict.shadow import Shadow
-from service.predict.torch_threads import forward_widths, set_helper_threads
+from service.predict.torch_threads import forward_widths, set_helper_threads, worker_count
 from service.recording.factory import make_recorder
 from service.scenes.fanout import FrameFanout
 from service.scenes.live import LiveScenes
@@ -55,8 +55,13 @@ class DataPlane:
         self._lifecycle = Lifecycle()
         self._references = ModelReferences()
         self._admission = Admission(settings.max_batch_agents, settings.max_queue_agents, metrics)
+        workers = worker_count(settings.workers, settings.threads)
         self._batcher = Batcher(
-            settings.max_batch_agents, self._admission, metrics, forward_widths(settings.threads)
+            settings.max_batch_agents,
+            self._admission,
+            metrics,
+            forward_widths(settings.threads, workers),
+            workers,
         )
         self._threads = ThreadPoolExecutor(
             min(_MAX_WORKERS, whole_cores() + 1),
@@ -170,6 +175,8 @@ class DataPlane:
         if self._shared_scenes is not None:
             self._shared_scenes.start()
         self._lifecycle.set_ready()
+        models = self._pipeline.catalog
+        self._batcher.start_workers([models.get(info.full_name) for info in models.models.infos()])
         if self._settings.reload_seconds is not None:
             self._following = asyncio.create_task(
                 self._reloader.follow(self._settings.reload_seconds), name="models"

@@ -8,14 +8,15 @@ import numpy as np
 import torch
 
 from cab.forecast.v1 import prediction_service_pb2 as pb
-from model.arrays import Bools, Ints
+from model.arrays import Ints
 from model.forecaster import Context, Forecaster, Protocol
-from model.mixture import MergedModes, TrajectoryMixture, merge_modes
+from model.mixture import MergedModes, merge_modes
 from model.scenes.resample import MAX_AGE, MAX_GAP, MIN_DIFFERENCE_SPAN, resample
 from model.scenes.scene import AgentType, Raster, Scene
 from service.errors import BadFields, Fault
 from service.predict.batcher import Job, Outcome
 from service.predict.catalog import Catalog
+from service.predict.forward import finite
 from service.predict.input_warnings import Warnings, input_warnings, of_context_agents
 from service.predict.request import Agents, Options, read_agents, read_raster
 from service.settings import FALLBACK_MODEL, Settings
@@ -232,16 +233,6 @@ def set_outcomes(groups: Sequence[Group], outcomes: Sequence[Outcome]) -> list[D
 def frames_of(forecaster: Forecaster, catalog: Catalog) -> int:
     """Return the number of history frames that a call may use."""
     return max(forecaster.info.history_frames, catalog.fallback.info.history_frames)
-
-
-def finite(mixture: TrajectoryMixture) -> Bools:
-    """Return which agents' forecasts are finite, and so can be sent: [N]."""
-    with np.errstate(over="ignore"):
-        weights = np.exp(mixture.log_weights.numpy().astype(np.float64))
-    mask: Bools = np.isfinite(weights).all(axis=1) & (weights.sum(axis=1) > 0)
-    for values in (mixture.means, mixture.covariances, mixture.origin):
-        mask &= np.isfinite(values.numpy()).all(axis=tuple(range(1, values.ndim)))
-    return mask
 
 
 def _build_scene(

@@ -16,22 +16,35 @@ _CORES = torch.get_num_threads()
 """torch's choice when the process starts: the physical cores."""
 
 
-def forward_widths(threads: int | None) -> tuple[int, ...]:
-    """Return the number of threads of a forward that runs alone, and of each of two at the same time.
+def forward_widths(threads: int | None, workers: int = 0) -> tuple[int, ...]:
+    """Return the number of threads of a forward that runs alone, and of each of several at the same time.
 
     Two forwards of half the cores each finish more than one after the other with all: the threads of one
     never wait for each other while other work of the server has a core. With one thread there is no second
-    forward.
+    number.
 
     Args:
         threads: the setting; None: as many as the quota allows, at most one for each physical core. More
             threads than a CPU quota allows would use it up early in each period and then stand still
             together.
+        workers: number of processes that run forwards at the same time; 0: two threads of this process do.
     """
     if threads is None:
         limited = usable_cores() < len(os.sched_getaffinity(0))
         threads = min(_CORES, whole_cores()) if limited else _CORES
-    return (threads,) if threads == 1 else (threads, threads // 2)
+    return (threads,) if threads == 1 else (threads, max(1, threads // (workers or 2)))
+
+
+def worker_count(workers: int | None, threads: int | None) -> int:
+    """Return the number of processes that run forwards; 0: threads of this process do.
+
+    Args:
+        workers: the setting; None: two, if a forward has two threads and the system has what they share.
+        threads: as in ``forward_widths``.
+    """
+    if workers is not None:
+        return workers
+    return 2 if forward_widths(threads)[0] > 1 and hasattr(os, "memfd_create") else 0
 
 
 def set_helper_threads() -> None:

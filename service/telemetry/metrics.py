@@ -83,6 +83,16 @@ class Metrics:
             buckets=_AGENTS,
             registry=self.registry,
         )
+        self.workers = Gauge(
+            "forecast_workers",
+            "Processes that run forwards; while one is replaced, the server's process runs its forwards.",
+            registry=self.registry,
+        )
+        self.worker_deaths = Counter(
+            "forecast_worker_deaths_total",
+            "Processes that ran forwards and died; the calls of the batch that they held failed.",
+            registry=self.registry,
+        )
         self.batches = Counter(
             "forecast_batches_total",
             "Batches by the reason why they have no more agents: no others waited that could join (empty), "

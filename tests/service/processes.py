@@ -18,6 +18,7 @@ def process(*arguments: str, **settings: object) -> Iterator["subprocess.Popen[s
     """
     command = [sys.executable, "-m", "service", "serve", "--http", "127.0.0.1:0", "--grpc", "127.0.0.1:0"]
     environment = {name: value for name, value in os.environ.items() if not name.startswith("FORECAST_")}
+    environment["FORECAST_WORKERS"] = os.environ["FORECAST_WORKERS"]
     environment |= {f"FORECAST_{name.upper()}": str(value) for name, value in settings.items()}
     with subprocess.Popen(  # noqa: S603 - ourselves
         [*command, *arguments], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment

@@ -487,7 +487,7 @@ async def test_fallback_must_reach_as_far() -> None:
 
 async def test_warm_up_meets_every_shape_of_the_default_model() -> None:
     fake, other = FakeForecaster(), FakeForecaster("other", supports_blind=False)
-    plane = DataPlane(settings(default_model="fake", max_batch_agents=6), Metrics())
+    plane = DataPlane(settings(default_model="fake", max_batch_agents=6, threads=1), Metrics())
     await plane.open(lambda _: registry(fake, other))
     await plane.close()
     limits = [agents for kind, agents, context, _ in fake.batches if context is Context.BLIND]

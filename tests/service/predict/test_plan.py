@@ -10,7 +10,8 @@ from model.scenes.scene import AgentType
 from service.errors import BadFields
 from service.predict.batcher import Outcome
 from service.predict.catalog import build_catalog
-from service.predict.plan import Group, Plan, finite, frames_of, make_plan, set_outcomes
+from service.predict.forward import finite
+from service.predict.plan import Group, Plan, frames_of, make_plan, set_outcomes
 from service.predict.request import read_agents, read_options
 from service.settings import FALLBACK_MODEL, Settings
 from tests.service.fakes import FakeForecaster, registry
