@@ -78,9 +78,9 @@ def count(server: Server, transport: str, method: str, code: str) -> float:
     return server.metrics.registry.get_sample_value("forecast_requests_total", labels) or 0.0
 
 
-async def until(condition: Callable[[], object]) -> None:
+async def until(condition: Callable[[], object], seconds: float = 10.0) -> None:
     """Wait until the condition holds."""
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(seconds):
         while not condition():  # noqa: ASYNC110 - no event tells
             await asyncio.sleep(0.005)
 
