@@ -82,7 +82,9 @@ def with_results(data: dict[str, list[Row]], results: Mapping[str, Any]) -> dict
             continue
         for table, make in made.items():
             row = {"model": label, **make(model["metrics"])}
-            whole = table != "merged_causal" or (row["fde_merged"][0] is not None and model["protocol"] != "any")
+            whole = table != "merged_causal" or (
+                row["fde_merged"][0] is not None and model["protocol"] != "any"
+            )
             if whole:
                 renewed[table][label] = row
     return {table: list(rows.values()) for table, rows in renewed.items()}
@@ -131,9 +133,7 @@ def main(
     for file in results:
         data = with_results(data, json.loads(file.read_text(encoding="utf-8")))
     tables = [
-        f"  {json.dumps(table)}: [\n"
-        + ",\n".join(f"    {json.dumps(row)}" for row in rows)
-        + "\n  ]"
+        f"  {json.dumps(table)}: [\n" + ",\n".join(f"    {json.dumps(row)}" for row in rows) + "\n  ]"
         for table, rows in data.items()
     ]
     BENCHMARK.write_text("{\n" + ",\n".join(tables) + "\n}\n", encoding="utf-8")

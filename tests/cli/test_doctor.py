@@ -24,7 +24,7 @@ def surroundings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in list(os.environ):
         if name.startswith("FORECAST_"):
             monkeypatch.delenv(name)
-    copy_bundled(tmp_path / "one", SMALL)
+    copy_bundled(tmp_path / "one", SMALL, "2.0.0")
     values = {"MODELS": str(tmp_path), "DEFAULT_MODEL": SMALL, "HTTP": "127.0.0.1:0", "GRPC": "127.0.0.1:0"}
     for name, value in values.items():
         monkeypatch.setenv(f"FORECAST_{name}", value)

@@ -14,7 +14,7 @@ SMALL = "trajectron-no-context"
 
 
 def test_it_tells_what_took_over_and_fails_if_one_was_refused(tmp_path: Path) -> None:
-    copy_bundled(tmp_path / "one", SMALL)
+    copy_bundled(tmp_path / "one", SMALL, "2.0.0")
     with (
         capture_logs(),
         in_thread(settings(models=tmp_path, default_model=SMALL, max_batch_agents=2)) as server,

@@ -150,7 +150,7 @@ async def test_a_model_that_is_dropped_is_freed() -> None:
 
 
 async def test_networks_are_freed_and_the_broken_are_refused(tmp_path: Path) -> None:
-    copy_bundled(tmp_path / "one", SMALL)
+    copy_bundled(tmp_path / "one", SMALL, "2.0.0")
     server = Server(settings(models=tmp_path, default_model=SMALL, max_batch_agents=4))
     await server.start()
     try:
@@ -220,7 +220,7 @@ async def test_sighup_reloads() -> None:
 
 
 async def test_a_folder_that_is_watched(tmp_path: Path) -> None:
-    copy_bundled(tmp_path / "one", SMALL)
+    copy_bundled(tmp_path / "one", SMALL, "2.0.0")
     values = settings(models=tmp_path, default_model=SMALL, max_batch_agents=4, reload_seconds=0.1)
     server = Server(values)
     await server.start()

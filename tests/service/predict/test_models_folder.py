@@ -25,7 +25,7 @@ def checkpoints(models: FolderModels) -> list[str]:
 
 
 def test_foreign_folders_are_passed_over_with_a_warning(tmp_path: Path) -> None:
-    copy_bundled(tmp_path / "one", SMALL)
+    copy_bundled(tmp_path / "one", SMALL, "2.0.0")
     (tmp_path / "lost+found").mkdir()
     (tmp_path / "odd").mkdir()
     (tmp_path / "odd" / "config.json").mkdir()  # it cannot be read as a file
@@ -40,7 +40,7 @@ def test_foreign_folders_are_passed_over_with_a_warning(tmp_path: Path) -> None:
 
 
 def test_what_has_not_changed_is_taken_over(tmp_path: Path) -> None:
-    copy_bundled(tmp_path / "one", SMALL)
+    copy_bundled(tmp_path / "one", SMALL, "2.0.0")
     first = load_models(own(tmp_path))
     (tmp_path / "one").rename(tmp_path / "renamed")
     copy_bundled(tmp_path / "two", SMALL, "2.1.0")
@@ -54,7 +54,7 @@ def test_what_has_not_changed_is_taken_over(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("damage", ["config", "no config", "weights", "other config"])
 def test_the_old_one_stays_where_the_new_one_is_damaged(tmp_path: Path, damage: str) -> None:
-    folder = copy_bundled(tmp_path / "one", SMALL)
+    folder = copy_bundled(tmp_path / "one", SMALL, "2.0.0")
     first = load_models(own(tmp_path))
     config = folder / "config.json"
     match damage:
@@ -79,7 +79,7 @@ def test_the_old_one_stays_where_the_new_one_is_damaged(tmp_path: Path, damage: 
 
 
 def test_a_model_that_fails_the_canary_scene_is_refused(tmp_path: Path) -> None:
-    copy_bundled(tmp_path / "good", SMALL)
+    copy_bundled(tmp_path / "good", SMALL, "2.0.0")
     wild = {name: 100 * tensor for name, tensor in tensors().items()}
     save_checkpoint(tmp_path / "random", info(name="random"), network(), wild, "")
     models = load_models(own(tmp_path))
@@ -90,7 +90,7 @@ def test_a_model_that_fails_the_canary_scene_is_refused(tmp_path: Path) -> None:
 
 
 def test_other_weights_need_another_version(tmp_path: Path) -> None:
-    folder = copy_bundled(tmp_path / "one", SMALL)
+    folder = copy_bundled(tmp_path / "one", SMALL, "2.0.0")
     first = load_models(own(tmp_path))
     shutil.rmtree(folder)
     copy_bundled(folder, "cab")
@@ -103,9 +103,9 @@ def test_other_weights_need_another_version(tmp_path: Path) -> None:
 
 
 def test_two_folders_with_one_model(tmp_path: Path) -> None:
-    copy_bundled(tmp_path / "b", SMALL)
+    copy_bundled(tmp_path / "b", SMALL, "2.0.0")
     first = load_models(own(tmp_path))
-    copy_bundled(tmp_path / "a", SMALL)
+    copy_bundled(tmp_path / "a", SMALL, "2.0.0")
     second = load_models(own(tmp_path), first)
     assert second.refused[0].folder == "a"
     assert "is in the folder b already" in second.refused[0].reason
@@ -119,7 +119,7 @@ def test_no_folder(tmp_path: Path) -> None:
 
 def test_the_fingerprint_changes_with_the_checkpoints(tmp_path: Path) -> None:
     assert fingerprint(None) == fingerprint(tmp_path) == frozenset()
-    copy_bundled(tmp_path / "one", SMALL)
+    copy_bundled(tmp_path / "one", SMALL, "2.0.0")
     (tmp_path / "lost+found").mkdir()
     before = fingerprint(tmp_path)
     assert len(before) == 2

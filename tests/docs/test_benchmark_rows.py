@@ -1,0 +1,86 @@
+"""Rows of the benchmark's tables in the documentation, from results files."""
+
+import json
+from typing import Any
+
+import pytest
+
+from docs.benchmark_rows import with_results
+from docs.generate import BENCHMARK
+
+FIGURES = {
+    **{f"{kind}_ml_{second}s_m": 0.123 + second for kind in ("ade", "fde") for second in range(1, 7)},
+    **{f"inside_{share}": share / 100 + 0.004 for share in (50, 90, 99)},
+    "off_road_ml": 0.126,
+    "off_road_f": 0.2,
+    "nll": 3.004,
+    "moving_nll": 2.5,
+    "min_ade_10_m": 1.5,
+    "fde_f_6s_m": 10.0,
+    "fde_merged_6s_m": 6.5,
+    "moving_fde_merged_6s_m": 6.25,
+    "dispersion_std_m": 1.75,
+    "fde_hardest_1_m": 20.06,
+}
+
+
+def results(*models: tuple[str, str, str], protocol: str = "causal", **changes: Any) -> dict[str, Any]:
+    made = [{"name": n, "version": v, "protocol": p, "metrics": FIGURES} for n, v, p in models]
+    return {"split": "train_val", "limit": None, "protocol": protocol, "models": made} | changes
+
+
+def data() -> dict[str, list[dict[str, Any]]]:
+    content: dict[str, list[dict[str, Any]]] = json.loads(BENCHMARK.read_text(encoding="utf-8"))
+    return content
+
+
+def row(tables: dict[str, list[dict[str, Any]]], table: str, model: str) -> dict[str, Any]:
+    (found,) = [one for one in tables[table] if one["model"] == model]
+    return found
+
+
+def test_a_row_is_renewed_in_its_place_and_has_the_fields_of_the_others() -> None:
+    before = data()
+    after = with_results(before, results(("rubiz", "9.0.0", "causal")))
+    for table in ("displacement_causal", "consistency_causal"):
+        assert [one["model"] for one in after[table]] == [one["model"] for one in before[table]]
+        assert row(after, table, "rubiz").keys() == row(before, table, "cab").keys()
+    assert row(after, "merged_causal", "rubiz").keys() == row(before, "merged_causal", "cab").keys()
+    assert after["displacement_paper"] == before["displacement_paper"]
+    assert row(after, "displacement_causal", "cab") == row(before, "displacement_causal", "cab")
+
+
+def test_figures_are_rounded_and_missing_ones_have_no_value() -> None:
+    tables = with_results(data(), results(("rubiz", "9.0.0", "causal")))
+    shown = row(tables, "displacement_causal", "rubiz")
+    assert shown["fde"] == [1.12, 2.12, 3.12, 4.12, 5.12, 6.12]
+    assert shown["inside_50_90_99"] == [50, 90, 99]
+    assert (shown["off_road"], shown["nll"]) == (0.13, 3.0)
+    shown = row(tables, "merged_causal", "rubiz")
+    assert shown["fde_merged"] == [6.5, 6.25]
+    assert shown["inside_90"] == [90, None]
+    shown = row(tables, "consistency_causal", "rubiz")
+    assert (shown["dispersion_std"], shown["dispersion_rms"]) == (1.75, None)
+    assert shown["hardest_fde_1_2_3"] == [20.1, None, None]
+
+
+def test_older_versions_are_named_with_them() -> None:
+    models = (("cab", "2.10.0", "causal"), ("cab", "2.9.0", "causal"), ("kalman", "1.0.0", "any"))
+    tables = with_results(data(), results(*models))
+    assert row(tables, "displacement_causal", "cab 2.9.0")["nll"] == 3.0
+    assert [one["model"] for one in tables["merged_causal"]][:1] == ["cab"]
+    assert not [one for one in tables["merged_causal"] if one["model"] == "kalman"]
+
+
+def test_a_protocol_takes_models_of_its_own_only() -> None:
+    models = (("cab", "3.0.0+paper", "paper"), ("reweight", "1.0.0", "causal"), ("kalman", "1.0.0", "any"))
+    tables = with_results(data(), results(*models, protocol="paper"))
+    assert row(tables, "displacement_paper", "cab")["nll"] == 3.0
+    assert row(tables, "displacement_paper", "kalman")["nll"] == 3.0
+    assert not [one for one in tables["displacement_paper"] if one["model"] == "reweight"]
+
+
+@pytest.mark.parametrize("change", [{"split": "val"}, {"limit": 300}])
+def test_figures_of_other_pairs_are_refused(change: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="whole of train_val"):
+        with_results(data(), results(("cab", "9.0.0", "causal"), **change))
