@@ -47,6 +47,11 @@ def pack_patches(patches: Float32s) -> Bytes:
     return packed
 
 
+def without_layer(packed: Tensor, layer: int) -> Tensor:
+    """Return packed patches in which a layer is absent; unknown pixels stay unknown."""
+    return packed & ~(_LEVELS - 1 << 2 * layer)
+
+
 def _table() -> Tensor:
     """Return the layers of each byte: [256, 3] in [-1, 1], 0 where unknown."""
     byte = torch.arange(256)

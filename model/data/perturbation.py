@@ -4,7 +4,7 @@
   patches cut for them. Over many epochs a network learns their very pixels: forecasts then change by metres
   when a raster is drawn anew or turned. A few hundred scenes are also memorised, futures included; in another
   size a scene is another one.
-- ``drop_context`` takes away parts of the context that a request may lack.
+- ``drop_context`` and ``drop_dividers`` take away parts of the context that a request may lack.
 - ``keep_standing`` and ``insert_stopped_vehicles`` restore what the prediction challenge leaves out. It
   selects agents that move and hides all others, so that in its scenes no standing agent stays, and none
   stands in anyone's lane. A network that recognises its scenes would learn just that.
@@ -16,7 +16,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from model.data.packing import UNKNOWN
+from model.data.packing import UNKNOWN, without_layer
 from model.features.agent_features import NEIGHBOR_POSITION_SCALE, NEIGHBOR_REACH_M
 from model.forecaster import Features
 from model.scenes.raster import FAR, NEAR, PatchGeometry
@@ -68,8 +68,11 @@ def jitter(features: Features, future: Tensor) -> tuple[Features, Tensor]:
         future: [N, T, 2], m, in the agents' frames, relative to now; not modified.
     """
     count = len(future)
-    chosen = (torch.rand(count, device=future.device) < JITTERED).nonzero()[:, 0]
-    stretch = 1.0 + MAX_STRETCH * (2 * torch.rand(len(chosen), device=future.device) - 1)
+    size = int((torch.rand(count) < JITTERED).sum())
+    # Batches are in random order, so the first or the last are as good as any, and need no copies
+    start = (count - size) * int(torch.randint(2, ()))
+    chosen = slice(start, start + size)
+    stretch = 1.0 + MAX_STRETCH * (2 * torch.rand(size, device=future.device) - 1)
     jittered, future = scaled(features, future, chosen, stretch)
     history = jittered["history"]
     frames = history.shape[1]
@@ -79,33 +82,29 @@ def jitter(features: Features, future: Tensor) -> tuple[Features, Tensor]:
     noise[:, -1, 6] = 0.0
     observed = torch.arange(frames, device=history.device) >= features["first"][:, None]
     jittered["history"] = history + noise * observed[..., None]
-    turn = MAX_TURN_RAD * (2 * torch.rand(len(chosen), device=history.device) - 1)
-    shift = MAX_SHIFT_M * (2 * torch.rand(len(chosen), 2, device=history.device) - 1)
-    bare = torch.rand(count, 2, device=history.device) < NO_DIVIDERS
+    turn = MAX_TURN_RAD * (2 * torch.rand(size, device=history.device) - 1)
+    shift = MAX_SHIFT_M * (2 * torch.rand(size, 2, device=history.device) - 1)
     for name, geometry in _MAPS.items():
         if name in features:
             patches = features[name]
             patches[chosen] = moved(patches[chosen], turn, shift, stretch, geometry)
-            for layer in range(2):
-                rows = bare[:, layer].nonzero()[:, 0]
-                known = (patches[rows] != 0).any(dim=1)
-                patches[rows, layer + 1] = -known.to(patches.dtype)
             jittered[name] = patches
     return jittered, future
 
 
 def scaled(
-    features: Features, future: Tensor, chosen: Tensor, factor: Tensor
+    features: Features, future: Tensor, chosen: slice, factor: Tensor
 ) -> tuple[dict[str, Tensor], Tensor]:
     """Return features, without the maps, and futures of scenes in another size; time runs as before.
 
     Args:
         features: features of N agents, in their frames; not modified.
         future: [N, T, 2], m.
-        chosen: [n] int64, the agents whose scenes are scaled.
+        chosen: the n agents whose scenes are scaled.
         factor: [n], factors of the scenes' sizes.
     """
-    scale = future.new_ones(len(future)).index_copy(0, chosen, factor)
+    scale = future.new_ones(len(future))
+    scale[chosen] = factor
     result = dict(features)
     history = features["history"].clone()
     history[..., :6] *= scale[:, None, None]  # positions, velocities, accelerations; the rest are angles
@@ -132,14 +131,16 @@ def moved(patches: Tensor, turn: Tensor, shift: Tensor, stretch: Tensor, geometr
         geometry: geometry of the patches.
     """
     size = geometry.size
-    row = torch.arange(size, device=patches.device, dtype=patches.dtype) - geometry.rows_behind
-    column = torch.arange(size, device=patches.device, dtype=patches.dtype) - geometry.columns_right
-    cos, sin = (part[:, None, None] / stretch[:, None, None] for part in (turn.cos(), turn.sin()))
-    offset = geometry.pixels_per_meter * shift
-    ahead = cos * row[:, None] - sin * column[None] + offset[:, :1, None] + geometry.rows_behind
-    left = sin * row[:, None] + cos * column[None] + offset[:, 1:, None] + geometry.columns_right
-    grid = torch.stack([left, ahead], dim=-1)
-    grid = (grid + 0.5) * (2 / size) - 1
+    index = torch.arange(size, device=patches.device, dtype=patches.dtype)
+    row, column = index - geometry.rows_behind, index - geometry.columns_right
+    # In the coordinates of grid_sample, which has the column first
+    unit = 2 / size
+    cos, sin = (unit * part / stretch for part in (turn.cos(), turn.sin()))
+    agent = shift.new_tensor([geometry.columns_right, geometry.rows_behind])
+    start = unit * (geometry.pixels_per_meter * shift.flip(1) + agent + 0.5) - 1
+    along = start[..., None] + torch.stack([sin, cos], dim=1)[..., None] * row
+    across = torch.stack([cos, -sin], dim=1)[..., None] * column
+    grid = (along[..., :, None] + across[..., None, :]).permute(0, 2, 3, 1)
     return F.grid_sample(patches, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
 
 
@@ -167,6 +168,22 @@ def drop_context(features: Features) -> Features:
     if "neighbors" in features:
         alone = torch.rand(count, device=device) < NO_NEIGHBORS
         dropped["neighbors"] = features["neighbors"] * ~alone[:, None, None]
+    return dropped
+
+
+def drop_dividers(features: Features) -> Features:
+    """Return features in which some agents' maps lack a layer of dividers.
+
+    Args:
+        features: as for ``drop_context``.
+    """
+    dropped = dict(features)
+    for name in _MAPS.keys() & features.keys():
+        patches = features[name].clone()
+        for layer in (1, 2):
+            rows = (torch.rand(len(patches), device=patches.device) < NO_DIVIDERS).nonzero()[:, 0]
+            patches[rows] = without_layer(patches[rows], layer)
+        dropped[name] = patches
     return dropped
 
 

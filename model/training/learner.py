@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from model.data.packing import unpack_patches
-from model.data.perturbation import drop_context, insert_stopped_vehicles, jitter
+from model.data.perturbation import drop_context, drop_dividers, insert_stopped_vehicles, jitter
 from model.forecaster import Features
 from model.networks.agent_frame import AgentFrameNetwork
 from model.networks.agent_frame import MapEncoder as PatchEncoder
@@ -178,7 +178,8 @@ def perturbed(batch: Batch, config: TrainingConfig) -> Batch:
     features = batch.features
     if config.stopped_vehicles:
         features = insert_stopped_vehicles(features, future)
-    features = dict(drop_context(features) if config.context_dropout else features)
+    features = drop_context(features) if config.context_dropout else features
+    features = dict(drop_dividers(features) if config.jitter else features)
     for name in features.keys() & {"map", "far_map"}:
         features[name] = unpack_patches(features[name])
     return Batch(*(jitter(features, future) if config.jitter else (features, future)))
