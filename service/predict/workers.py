@@ -293,7 +293,7 @@ class Worker:
         """Start a process after a pause, and use it once it has loaded the models."""
         if self._closed.wait(pause):
             return
-        process = _Process()
+        process = _Process(self._widths[0])
         try:
             while not self._closed.is_set():
                 with self._lock:  # models may come and go while others are loaded
@@ -314,7 +314,11 @@ class Worker:
 class _Process:
     """A running worker process, and the models that it has loaded."""
 
-    def __init__(self) -> None:
+    def __init__(self, threads: int) -> None:
+        """
+        Args:
+            threads: number of threads that cut map patches.
+        """
         ours, theirs = socket.socketpair()
         memory = [os.memfd_create(f"forecast-{name}", os.MFD_CLOEXEC) for name in ("parts", "mixtures")]
         try:
@@ -322,7 +326,7 @@ class _Process:
                 os.ftruncate(one, ARENA_BYTES)
             numbers = [theirs.fileno(), *memory]
             self._process = subprocess.Popen(  # noqa: S603 (our own module)
-                [sys.executable, "-c", _COMMAND, *map(str, numbers)],
+                [sys.executable, "-c", _COMMAND, *map(str, numbers), str(threads)],
                 pass_fds=numbers,
                 stdin=subprocess.DEVNULL,
             )
@@ -443,18 +447,18 @@ class _Models:
 
 def main() -> None:
     """Run a worker: answer messages until the server closes the socket."""
-    connection, incoming, outgoing = map(int, sys.argv[1:4])
+    connection, incoming, outgoing, threads = map(int, sys.argv[1:5])
     # Signals to the whole group are for the server, which still needs its workers while it drains
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     channel = SharedChannel(Connection(connection), outgoing, incoming)
-    with ThreadPoolExecutor(os.cpu_count(), "patches", initializer=set_helper_threads) as cutters:
+    with ThreadPoolExecutor(threads, "patches", initializer=set_helper_threads) as cutters:
         models = _Models(cutters)
         while True:
             try:
                 message: _Message = channel.receive()
             except (EOFError, OSError):
-                return
+                os._exit(0)  # at once: there is nothing to save, and libraries take a second to end
             answer: object
             try:
                 answer = models.answer(message)
