@@ -213,10 +213,15 @@ class Batcher:
         self._worker = asyncio.create_task(self._work(), name="batcher")
         self._worker.add_done_callback(self._check)
 
-    def start_workers(self, forecasters: Sequence[Forecaster]) -> None:
-        """Begin to start the processes, if there are any; until they have loaded the models, threads do."""
+    def start_workers(self, forecasters: Sequence[Forecaster], default: Forecaster) -> None:
+        """Begin to start the processes, if there are any; until they have loaded the models, threads do.
+
+        Args:
+            forecasters: the models.
+            default: the one that most calls use.
+        """
         for worker in self._workers:
-            worker.start(forecasters)
+            worker.start(forecasters, default, self._max_batch)
 
     async def stop(self) -> None:
         """Fail the queued jobs, and wait for the batches that are in the model."""

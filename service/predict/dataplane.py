@@ -175,8 +175,10 @@ class DataPlane:
         if self._shared_scenes is not None:
             self._shared_scenes.start()
         self._lifecycle.set_ready()
-        models = self._pipeline.catalog
-        self._batcher.start_workers([models.get(info.full_name) for info in models.models.infos()])
+        catalog = self._pipeline.catalog
+        self._batcher.start_workers(
+            [catalog.get(info.full_name) for info in catalog.models.infos()], catalog.default
+        )
         if self._settings.reload_seconds is not None:
             self._following = asyncio.create_task(
                 self._reloader.follow(self._settings.reload_seconds), name="models"

@@ -75,6 +75,8 @@ class _Load:
     tensors: dict[str, torch.Tensor]
     widths: tuple[int, ...]
     """Numbers of threads that its native forward may have; empty: it runs in PyTorch."""
+    max_batch: int
+    """Number of agents of the largest first forward."""
 
 
 @dataclass(frozen=True)
@@ -199,11 +201,17 @@ class Worker:
         process = self._process
         return None if process is None else process.pid
 
-    def start(self, forecasters: Iterable[Forecaster]) -> None:
-        """Begin to start the process, with models that it loads before its first forward."""
+    def start(self, forecasters: Iterable[Forecaster], default: Forecaster, max_batch: int) -> None:
+        """Begin to start the process, with models that it loads before its first forward.
+
+        Args:
+            forecasters: the models.
+            default: the one that most calls use: its first forwards are of all sizes.
+            max_batch: max number of agents in one forward.
+        """
         for forecaster in forecasters:
             if isinstance(forecaster, NetworkForecaster):
-                self._loading(forecaster)
+                self._loading(forecaster, max_batch if forecaster is default else _SCENE_AGENTS)
         self._start_in_thread(0.0)
 
     def forward(
@@ -256,14 +264,14 @@ class Worker:
         if self._process is not None:
             self._process.end()
 
-    def _loading(self, forecaster: NetworkForecaster[Any]) -> _Load:
+    def _loading(self, forecaster: NetworkForecaster[Any], max_batch: int = _SCENE_AGENTS) -> _Load:
         """Return the message that loads a model, which a replacement gets, too."""
         key = id(forecaster)
         with self._lock:
             if key not in self._models:
                 widths = self._widths if forecaster.is_compiled else ()
                 tensors = dict(forecaster.networks.state_dict())
-                self._models[key] = _Load(key, forecaster.info, forecaster.config, tensors, widths)
+                self._models[key] = _Load(key, forecaster.info, forecaster.config, tensors, widths, max_batch)
             return self._models[key]
 
     def _live_process(self) -> "_Process | None":
@@ -427,22 +435,24 @@ class _Models:
             forecaster = Checkpoint(Path(), message.info, message.network, tensors).forecaster()
             if message.widths:
                 forecaster.compile(message.widths)
-            self._warm_up(forecaster, message.widths or (torch.get_num_threads(),))
+            self._warm_up(forecaster, message.widths or (torch.get_num_threads(),), message.max_batch)
             self._forecasters[message.key] = forecaster
         else:
             for key in message.keys:
                 self._forecasters.pop(key, None)
         return None
 
-    def _warm_up(self, forecaster: Forecaster, widths: Sequence[int]) -> None:
+    def _warm_up(self, forecaster: Forecaster, widths: Sequence[int], max_batch: int) -> None:
         """Run the first forwards, which allocate and cache, before a call waits for one."""
         info = forecaster.info
         for agent_type in info.agent_types:
-            scene = straight_scene(agent_type, info.history_frames, [_SPEED] * _SCENE_AGENTS)
+            scene = straight_scene(agent_type, info.history_frames, [_SPEED] * max_batch)
             for context in info.contexts:
-                parts = [forecaster.view(scene, np.arange(_SCENE_AGENTS), context)]
+                whole = forecaster.view(scene, np.arange(max_batch), context)
                 for width in widths:
-                    forward(forecaster, agent_type, context, parts, info.steps, width, self._cutters)
+                    for agents in {min(_SCENE_AGENTS, max_batch), max_batch}:
+                        parts = [whole[:agents]]
+                        forward(forecaster, agent_type, context, parts, info.steps, width, self._cutters)
 
 
 def main() -> None:

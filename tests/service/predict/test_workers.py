@@ -135,7 +135,7 @@ def test_the_other_end_of_a_closed_channel_ends(channels: tuple[SharedChannel, S
 
 
 def test_a_worker_forecasts_as_the_server_does(worker: Worker, cab: Forecaster) -> None:
-    worker.start([cab])
+    worker.start([cab], cab, 16)
     parts = [*parts_of(cab, [0.0, 5.0, 9.0]), *parts_of(cab, [12.0])]
     here = forward(cab, VEHICLE, Context.FULL, parts, 12, 1, CUTTERS)
     before = run(worker, cab, parts)  # the process starts only now, so this ran here
@@ -153,7 +153,7 @@ def test_a_worker_forecasts_as_the_server_does(worker: Worker, cab: Forecaster) 
 def test_a_model_that_comes_later_is_loaded_and_one_that_goes_is_forgotten(
     worker: Worker, cab: Forecaster
 ) -> None:
-    worker.start([])
+    worker.start([], cab, 16)
     until(lambda: worker.is_ready)
     parts = parts_of(cab, [5.0])
     first = run(worker, cab, parts)
@@ -161,8 +161,8 @@ def test_a_model_that_comes_later_is_loaded_and_one_that_goes_is_forgotten(
     assert same(first, run(worker, cab, parts))
 
 
-def test_other_forecasters_run_in_the_calling_thread(worker: Worker) -> None:
-    worker.start([])
+def test_other_forecasters_run_in_the_calling_thread(worker: Worker, cab: Forecaster) -> None:
+    worker.start([], cab, 16)
     until(lambda: worker.is_ready)
     fake = FakeForecaster()
     run(worker, fake, [Prepared({"position": torch.zeros(2, 2), "velocity": torch.ones(2, 2)})])
@@ -170,7 +170,7 @@ def test_other_forecasters_run_in_the_calling_thread(worker: Worker) -> None:
 
 
 def test_a_forward_that_fails_fails_alone(worker: Worker, cab: Forecaster) -> None:
-    worker.start([cab])
+    worker.start([cab], cab, 16)
     until(lambda: worker.is_ready)
     (good,) = parts_of(cab, [5.0])
     bad = Prepared({name: tensor for name, tensor in good.features.items() if name != "history"}, good.views)
@@ -184,7 +184,7 @@ def test_a_forward_that_fails_fails_alone(worker: Worker, cab: Forecaster) -> No
 def test_a_worker_that_dies_in_a_forward_costs_that_one_and_is_replaced(
     worker: Worker, cab: Forecaster, deaths: list[int]
 ) -> None:
-    worker.start([cab])
+    worker.start([cab], cab, 16)
     until(lambda: worker.is_ready)
     parts = parts_of(cab, [5.0, 8.0])
     expected = run(worker, cab, parts)
@@ -208,7 +208,7 @@ def test_a_worker_that_dies_in_a_forward_costs_that_one_and_is_replaced(
 def test_a_worker_that_dies_between_forwards_costs_none(
     worker: Worker, cab: Forecaster, deaths: list[int]
 ) -> None:
-    worker.start([cab])
+    worker.start([cab], cab, 16)
     until(lambda: worker.is_ready)
     parts = parts_of(cab, [5.0])
     expected = run(worker, cab, parts)
@@ -222,7 +222,7 @@ def test_a_worker_that_dies_between_forwards_costs_none(
 
 def test_a_worker_ends_with_its_server(cab: Forecaster) -> None:
     made = Worker(0, (1,), lambda: None)
-    made.start([cab])
+    made.start([cab], cab, 16)
     until(lambda: made.is_ready)
     pid = made.pid
     assert pid is not None
@@ -236,7 +236,7 @@ def test_a_worker_ends_with_its_server(cab: Forecaster) -> None:
 
 def test_a_worker_that_is_closed_while_it_starts_leaves_no_process(cab: Forecaster) -> None:
     made = Worker(0, (1,), lambda: None)
-    made.start([cab])
+    made.start([cab], cab, 16)
     made.close()
     assert not made.is_ready
     assert made.pid is None
