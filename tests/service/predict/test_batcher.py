@@ -360,13 +360,22 @@ async def test_a_crash_beside_another_forward_is_told_once(
     other.free.clear()
     calls = [submit(batcher, job(fake, 8)), submit(batcher, job(other, 8))]
     await asyncio.gather(entered_again(fake), entered_again(other))
-    monkeypatch.setattr(batcher, "_deliver", Mock(side_effect=[RuntimeError("a bug"), None]))
+    deliver = batcher._deliver
+    first = [RuntimeError("a bug")]
+
+    def fail_once(*arguments):  # type: ignore[no-untyped-def]
+        if first:
+            raise first.pop()
+        deliver(*arguments)
+
+    monkeypatch.setattr(batcher, "_deliver", fail_once)
     tasks = [batch.task for batch in batcher._batches if batch.task]
     for forecaster in (fake, other):
         forecaster.free.set()
-    for call in calls:
-        with pytest.raises(Internal):
-            await call
+    # The other forward may end in the same turn of the event loop, before the crash is known
+    results = await asyncio.gather(*calls, return_exceptions=True)
+    assert any(isinstance(result, Internal) for result in results)
+    assert all(isinstance(result, Internal | list) for result in results)
     await asyncio.wait(tasks)
     await settle()
     crash.assert_called_once_with()
