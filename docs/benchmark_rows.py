@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from packaging.version import Version
 
 from docs.generate import BENCHMARK, Row
 
@@ -94,17 +95,13 @@ def _labels(models: list[Mapping[str, Any]]) -> list[str]:
     """Return the names of models in tables; of several versions all but the newest have theirs behind."""
     newest: dict[str, tuple[int, ...]] = {}
     for model in models:
-        newest[model["name"]] = max(newest.get(model["name"], ()), _version(model["version"]))
+        newest[model["name"]] = max(newest.get(model["name"], ()), Version(model["version"]).release)
     return [
         model["name"]
-        if _version(model["version"]) == newest[model["name"]]
+        if Version(model["version"]).release == newest[model["name"]]
         else f"{model['name']} {model['version']}"
         for model in models
     ]
-
-
-def _version(text: str) -> tuple[int, ...]:
-    return tuple(int(part) for part in text.partition("+")[0].split("."))
 
 
 def _number(metrics: Metrics, name: str, digits: int = 2) -> float | None:

@@ -95,7 +95,7 @@ class Tracks:
 
 @dataclass
 class Report:
-    """What happened since the last report."""
+    """Counts since the last report."""
 
     calls: int = 0
     failed: Counter[str] = field(default_factory=Counter)

@@ -285,7 +285,8 @@ class Batcher:
         slowest = 0.0
         for width in self._widths:
             # Threads share what a forward allocates and compiles; processes do not
-            slots = self._slots if self._workers else self._slots[:1]
+            apart = [slot for slot in self._slots if slot.worker is not None and slot.worker.is_ready]
+            slots = apart or self._slots[:1]
             if slowest < MAX_BATCH_SECONDS:
                 for slot in slots:
                     slowest = max(slowest, (await self._run_alone(job, slot, width)).inference)

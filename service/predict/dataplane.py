@@ -55,13 +55,12 @@ class DataPlane:
         self._lifecycle = Lifecycle()
         self._references = ModelReferences()
         self._admission = Admission(settings.max_batch_agents, settings.max_queue_agents, metrics)
-        workers = worker_count(settings.workers, settings.threads)
         self._batcher = Batcher(
             settings.max_batch_agents,
             self._admission,
             metrics,
-            forward_widths(settings.threads, workers),
-            workers,
+            forward_widths(settings.threads, settings.workers),
+            worker_count(settings.workers, settings.threads),
         )
         self._threads = ThreadPoolExecutor(
             min(_MAX_WORKERS, whole_cores() + 1),

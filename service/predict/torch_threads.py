@@ -16,7 +16,7 @@ _CORES = torch.get_num_threads()
 """torch's choice when the process starts: the physical cores."""
 
 
-def forward_widths(threads: int | None, workers: int = 0) -> tuple[int, ...]:
+def forward_widths(threads: int | None, workers: int | None = None) -> tuple[int, ...]:
     """Return the number of threads of a forward that runs alone, and of each of several at the same time.
 
     Two forwards of half the cores each finish more than one after the other with all: the threads of one
@@ -27,12 +27,10 @@ def forward_widths(threads: int | None, workers: int = 0) -> tuple[int, ...]:
         threads: the setting; None: as many as the quota allows, at most one for each physical core. More
             threads than a CPU quota allows would use it up early in each period and then stand still
             together.
-        workers: number of processes that run forwards at the same time; 0: two threads of this process do.
+        workers: as in ``worker_count``; without workers, two threads of this process run forwards.
     """
-    if threads is None:
-        limited = usable_cores() < len(os.sched_getaffinity(0))
-        threads = min(_CORES, whole_cores()) if limited else _CORES
-    return (threads,) if threads == 1 else (threads, max(1, threads // (workers or 2)))
+    alone = _threads(threads)
+    return (alone,) if alone == 1 else (alone, max(1, alone // (worker_count(workers, threads) or 2)))
 
 
 def worker_count(workers: int | None, threads: int | None) -> int:
@@ -44,7 +42,15 @@ def worker_count(workers: int | None, threads: int | None) -> int:
     """
     if workers is not None:
         return workers
-    return 2 if forward_widths(threads)[0] > 1 and hasattr(os, "memfd_create") else 0
+    return 2 if _threads(threads) > 1 and hasattr(os, "memfd_create") else 0
+
+
+def _threads(threads: int | None) -> int:
+    """Return the number of threads of a forward that runs alone."""
+    if threads is not None:
+        return threads
+    limited = usable_cores() < len(os.sched_getaffinity(0))
+    return min(_CORES, whole_cores()) if limited else _CORES
 
 
 def set_helper_threads() -> None:
