@@ -23,7 +23,7 @@ from model.mixture import TrajectoryMixture
 from model.scenes.scene import AgentType
 from service.errors import DeadlineExceeded, Internal, Unavailable
 from service.predict.admission import Admission, Call
-from service.predict.forward import Forwarded, forward
+from service.predict.forward import Batch, Forwarded, forward
 from service.predict.scheduler import MAX_BATCH_SECONDS, DeadlineQueue
 from service.predict.torch_threads import set_helper_threads
 from service.predict.workers import Worker
@@ -147,9 +147,8 @@ class _Slot:
     ) -> "asyncio.Future[Forwarded]":
         """Give a forward to the thread."""
         run = forward if self.worker is None else self.worker.forward
-        return asyncio.get_running_loop().run_in_executor(
-            self.thread, run, job.forecaster, job.agent_type, job.context, parts, steps, width, cutters
-        )
+        batch = Batch(job.agent_type, job.context, parts, steps, width)
+        return asyncio.get_running_loop().run_in_executor(self.thread, run, job.forecaster, batch, cutters)
 
     @property
     def until(self) -> float:

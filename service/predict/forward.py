@@ -29,24 +29,25 @@ class Forwarded(NamedTuple):
     """Seconds of these in which map patches were cut."""
 
 
-def forward(
-    forecaster: Forecaster,
-    agent_type: AgentType,
-    context: Context,
-    parts: Sequence[Prepared],
-    steps: int,
-    width: int,
-    cutters: Executor,
-) -> Forwarded:
-    """Run one forward of a forecaster over joined parts.
+class Batch(NamedTuple):
+    """The agents of a forward, and how it is to run."""
+
+    agent_type: AgentType
+    """Type of all agents."""
+    context: Context
+    """The context that the parts were prepared with."""
+    parts: Sequence[Prepared]
+    steps: int
+    width: int
+    """Number of threads of the forward."""
+
+
+def forward(forecaster: Forecaster, batch: Batch, cutters: Executor) -> Forwarded:
+    """Run one forward of a forecaster over the joined parts of a batch.
 
     Args:
         forecaster: the forecaster.
-        agent_type: type of all agents.
-        context: the context that the parts were prepared with.
-        parts: the agents of the batch.
-        steps: number of steps.
-        width: number of threads of the forward.
+        batch: the batch.
         cutters: threads that cut map patches; with one thread the forward's own cuts them.
 
     Returns:
@@ -56,14 +57,14 @@ def forward(
         RuntimeError: the mixture is not one of the expected agents, modes and steps.
     """
     started = time.perf_counter()
-    if torch.get_num_threads() != width:
-        torch.set_num_threads(width)
+    if torch.get_num_threads() != batch.width:
+        torch.set_num_threads(batch.width)
     with torch.inference_mode():
-        agents = sum(map(len, parts))
-        features = complete(parts, cutters if width > 1 and agents >= _CUT_IN_THREADS else None)
+        agents = sum(map(len, batch.parts))
+        features = complete(batch.parts, cutters if batch.width > 1 and agents >= _CUT_IN_THREADS else None)
         patches = time.perf_counter() - started
-        mixture = forecaster.forecast(features, agent_type, context, steps)
-    require_shapes(forecaster.info, mixture, agents, steps)
+        mixture = forecaster.forecast(features, batch.agent_type, batch.context, batch.steps)
+    require_shapes(forecaster.info, mixture, agents, batch.steps)
     return Forwarded(mixture, started, time.perf_counter() - started, patches)
 
 

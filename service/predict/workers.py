@@ -32,13 +32,12 @@ import structlog
 import torch
 
 from model.checkpoint import Checkpoint
-from model.forecaster import Context, Forecaster, ModelInfo, Prepared
+from model.forecaster import Forecaster, ModelInfo
 from model.mixture import TrajectoryMixture
 from model.networks.config import AnyNetworkConfig
 from model.networks.forecaster import NetworkForecaster
-from model.scenes.scene import AgentType
 from service.predict.canary import straight_scene
-from service.predict.forward import Forwarded, forward
+from service.predict.forward import Batch, Forwarded, forward
 from service.predict.torch_threads import set_helper_threads
 
 _log = structlog.get_logger(__name__)
@@ -91,11 +90,7 @@ class _Forward:
     """Message to a worker: a batch."""
 
     key: int
-    agent_type: AgentType
-    context: Context
-    parts: Sequence[Prepared]
-    steps: int
-    width: int
+    batch: Batch
 
 
 _Message: TypeAlias = _Load | _Forget | _Forward
@@ -214,16 +209,7 @@ class Worker:
                 self._loading(forecaster, max_batch if forecaster is default else _SCENE_AGENTS)
         self._start_in_thread(0.0)
 
-    def forward(
-        self,
-        forecaster: Forecaster,
-        agent_type: AgentType,
-        context: Context,
-        parts: Sequence[Prepared],
-        steps: int,
-        width: int,
-        cutters: Executor,
-    ) -> Forwarded:
+    def forward(self, forecaster: Forecaster, batch: Batch, cutters: Executor) -> Forwarded:
         """Run a forward in the process if there is one and the forecaster is a network, else here.
 
         Args and result are those of ``forward.forward``.
@@ -234,11 +220,11 @@ class Worker:
         """
         process = self._live_process()
         if process is None or not isinstance(forecaster, NetworkForecaster):
-            return forward(forecaster, agent_type, context, parts, steps, width, cutters)
+            return forward(forecaster, batch, cutters)
         load = self._loading(forecaster)
         try:
             process.load(load)
-            return process.forward(_Forward(load.key, agent_type, context, parts, steps, width))
+            return process.forward(_Forward(load.key, batch))
         except (EOFError, OSError) as error:
             self._replace(process)
             raise WorkerDiedError(f"worker {self._number} died during a forward") from error
@@ -315,6 +301,10 @@ class Worker:
                 return
         except (EOFError, OSError):
             self._replace(process)
+            return
+        except RuntimeError:
+            _log.exception("worker cannot load a model", worker=self._number)
+            process.end()
             return
         _log.info("worker started", worker=self._number, pid=process.pid)
 
@@ -420,15 +410,7 @@ class _Models:
     def answer(self, message: _Message) -> object:
         """Return the answer to a message."""
         if isinstance(message, _Forward):
-            return forward(
-                self._forecasters[message.key],
-                message.agent_type,
-                message.context,
-                message.parts,
-                message.steps,
-                message.width,
-                self._cutters,
-            )
+            return forward(self._forecasters[message.key], message.batch, self._cutters)
         if isinstance(message, _Load):
             # Parameters outlive the message, whose memory is written anew
             tensors = {name: tensor.clone() for name, tensor in message.tensors.items()}
@@ -451,8 +433,8 @@ class _Models:
                 whole = forecaster.view(scene, np.arange(max_batch), context)
                 for width in widths:
                     for agents in {min(_SCENE_AGENTS, max_batch), max_batch}:
-                        parts = [whole[:agents]]
-                        forward(forecaster, agent_type, context, parts, info.steps, width, self._cutters)
+                        batch = Batch(agent_type, context, [whole[:agents]], info.steps, width)
+                        forward(forecaster, batch, self._cutters)
 
 
 def main() -> None:

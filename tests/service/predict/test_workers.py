@@ -18,7 +18,7 @@ from model.forecaster import Context, Forecaster, Prepared
 from model.networks.forecaster import NetworkForecaster
 from model.scenes.scene import AgentType
 from service.predict.canary import straight_scene
-from service.predict.forward import Forwarded, forward
+from service.predict.forward import Batch, Forwarded, forward
 from service.predict.workers import ARENA_BYTES, SharedChannel, Worker, WorkerDiedError
 from service.settings import bundled_models
 from tests.service.fakes import FakeForecaster
@@ -69,7 +69,7 @@ def parts_of(forecaster: Forecaster, speeds: list[float], context: Context = Con
 
 
 def run(worker: Worker, forecaster: Forecaster, parts: list[Prepared]) -> Forwarded:
-    return worker.forward(forecaster, VEHICLE, Context.FULL, parts, 12, 1, CUTTERS)
+    return worker.forward(forecaster, Batch(VEHICLE, Context.FULL, parts, 12, 1), CUTTERS)
 
 
 def kill(worker: Worker) -> int:
@@ -137,7 +137,7 @@ def test_the_other_end_of_a_closed_channel_ends(channels: tuple[SharedChannel, S
 def test_a_worker_forecasts_as_the_server_does(worker: Worker, cab: Forecaster) -> None:
     worker.start([cab], cab, 16)
     parts = [*parts_of(cab, [0.0, 5.0, 9.0]), *parts_of(cab, [12.0])]
-    here = forward(cab, VEHICLE, Context.FULL, parts, 12, 1, CUTTERS)
+    here = forward(cab, Batch(VEHICLE, Context.FULL, parts, 12, 1), CUTTERS)
     before = run(worker, cab, parts)  # the process starts only now, so this ran here
     until(lambda: worker.is_ready)
     there = run(worker, cab, parts)
