@@ -109,7 +109,7 @@ def features_in_agent_frame(agents: int) -> Features:
 def main() -> None:
     """Print the table; the networks alternate, so that other load on the machine affects them equally."""
     served = cab_network(Frame.AGENT)
-    if not served.compile([torch.get_num_threads()]):
+    if not served.compile(torch.get_num_threads()):
         raise RuntimeError("the network in the agent's frame has no graph")
     models = (
         ("ground", Frame.GROUND, cab_network(Frame.GROUND)),

@@ -184,7 +184,7 @@ class ForwardInProcess:
             info = self._reference.info
             self._timed = Registry.load(self._models).get(info.full_name)
             if engine != "eager":
-                self._timed.compile([threads or torch.get_num_threads()])
+                self._timed.compile(threads or torch.get_num_threads())
         kind = AgentType.VEHICLE
         batches = list(self._batches(self._timed))
         with torch.inference_mode():

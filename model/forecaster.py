@@ -148,15 +148,13 @@ class Forecaster(ABC):
             steps: T, at most ``info.steps``; None: ``info.steps``.
         """
 
-    def compile(self, widths: Sequence[int]) -> bool:
+    def compile(self, threads: int) -> bool:
         """Run forwards as native calls from now on, and return whether they are.
 
-        Answers stay the same within 1e-3 m. A forecaster without a native forward changes nothing. A forward
-        has as many threads as torch in the thread that calls it, if that is among the widths, else as many as
-        the next smaller width, or the smallest.
+        Answers stay the same within 1e-3 m. A forecaster without a native forward changes nothing.
 
         Args:
-            widths: the numbers of threads that a forward may have.
+            threads: number of threads of a forward.
         """
         return False
 

@@ -169,12 +169,12 @@ class Settings(BaseSettings):
     drain_seconds: float = Field(default=10.0, ge=0)
     """Seconds that accepted calls get to finish when the server stops."""
     threads: int | None = Field(default=None, ge=1, le=1024)
-    """Number of threads of a forward, and half as many for each of two at a time; None: the physical cores,
-    at most the cores of the CPU quota."""
+    """Number of threads of all forwards together; None: the physical cores, at most the cores of the CPU
+    quota."""
     workers: int | None = Field(default=None, ge=0, le=256)
     """Number of processes that run forwards, each with an interpreter of its own and its share of the
-    threads; 0: threads of the server's process run them, two at a time. None: two, if a forward has two
-    threads."""
+    threads; 0: threads of the server's process run them, two at a time. None: one for each thread, at most
+    four; with a single thread 0."""
     engine: Engine = Engine.ONNXRUNTIME
     """Engine of the forward: ``onnxruntime`` runs networks of the agent's frame as one native call and all
     other models in PyTorch; ``eager`` runs all models in PyTorch."""

@@ -73,7 +73,7 @@ class Network:
         if served.engine == "eager":
             if served.threads is not None:
                 torch.set_num_threads(served.threads)
-        elif self._forecaster.compile([served.threads or torch.get_num_threads()]):
+        elif self._forecaster.compile(served.threads or torch.get_num_threads()):
             torch.set_num_threads(
                 1
             )  # the few operations beside the forward would start a team for each thread

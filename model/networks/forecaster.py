@@ -1,6 +1,6 @@
 """Forecasters around trained networks: CVAEs and CoverNet."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, Generic, TypeVar
@@ -79,17 +79,14 @@ class NetworkForecaster(Forecaster, Generic[SomeNetworks]):
         _check(dict(self.networks.state_dict()), tensors)
         self.networks.load_state_dict(dict(tensors), assign=True)
         self.networks.eval().requires_grad_(False)
-        self._graphs: dict[tuple[AgentType, Context], dict[int, GraphForward]] = {}
+        self._graphs: dict[tuple[AgentType, Context], GraphForward] = {}
 
-    def compile(self, widths: Sequence[int]) -> bool:
+    def compile(self, threads: int) -> bool:
         if self.info.history_frames != HISTORY_FRAMES:
             return False
         try:
             self._graphs = {
-                (agent_type, context): {
-                    width: GraphForward(self.networks.of(agent_type), context, width)
-                    for width in sorted(widths)
-                }
+                (agent_type, context): GraphForward(self.networks.of(agent_type), context, threads)
                 for agent_type in self.info.agent_types
                 for context in self.info.contexts
             }
@@ -140,11 +137,9 @@ class NetworkForecaster(Forecaster, Generic[SomeNetworks]):
         steps: int | None = None,
     ) -> TrajectoryMixture:
         steps = steps or self.info.steps
-        graphs = self._graphs.get((agent_type, context))
-        if graphs is None:
+        graph = self._graphs.get((agent_type, context))
+        if graph is None:
             return network_mixture(self.networks.of(agent_type), features, context, steps, MIN_VARIANCE)
-        threads = torch.get_num_threads()
-        graph = graphs[max((width for width in graphs if width <= threads), default=min(graphs))]
         with one_torch_thread():
             return network_mixture(graph, features, context, steps, MIN_VARIANCE)
 

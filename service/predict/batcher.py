@@ -1,16 +1,15 @@
 """Dynamic batching: calls that wait for the model at the same time share a forward.
 
-A batch starts as soon as a thread of the model is free and never waits for more calls: under light load a
-call runs alone, under heavy load batches grow by themselves. The most urgent work goes first
-(``service.predict.scheduler``). A forward that runs alone uses all cores; forwards that run at the same time
-share them, so that none waits for a core that another thread has. Everything except the forward runs on the
-event loop, so there are no locks.
+A batch starts as soon as a forward may and never waits for more calls: under light load a call runs alone,
+under heavy load batches grow by themselves. The most urgent work goes first (``service.predict.scheduler``).
+Several forwards run at the same time and share the cores; where nothing else waits, the agents of a call are
+spread over them. Everything except the forward runs on the event loop, so there are no locks.
 """
 
 import asyncio
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
@@ -24,8 +23,8 @@ from model.scenes.scene import AgentType
 from service.errors import DeadlineExceeded, Internal, Unavailable
 from service.predict.admission import Admission, Call
 from service.predict.forward import Batch, Forwarded, forward
-from service.predict.scheduler import MAX_BATCH_SECONDS, DeadlineQueue
-from service.predict.torch_threads import set_helper_threads
+from service.predict.scheduler import DeadlineQueue
+from service.predict.torch_threads import ONE_FORWARD, ForwardThreads, make_cutters
 from service.predict.workers import Worker
 from service.telemetry.metrics import Metrics
 
@@ -38,6 +37,8 @@ _MANY_AGENTS = 16
 _AHEAD_SECONDS = 0.015
 """Seconds before the end of a forward from which on its thread is given the next batch: the event loop may be
 busy for as long when it ends."""
+_PART_SECONDS = 0.003
+"""Seconds of work that forwards get at least where several could share it: to hand it over takes 0.5 ms."""
 _SPARE_SECONDS = 0.01
 """Seconds that a forward outside the queue may be expected to take."""
 _POLL = 0.002
@@ -72,9 +73,10 @@ class Outcome:
     mixture: TrajectoryMixture
     """Forecasts of the job's agents, in order."""
     queue: float
-    """Seconds from the start of the call until its (first) batch started."""
+    """Seconds from the start of the call until its (first) batch started; of a job that ran past the queue,
+    when that was by ``time.perf_counter``."""
     inference: float
-    """Seconds in the model, summed over its batches."""
+    """Seconds in the model: see ``seconds_in_model``."""
     batch_agents: int
     """Number of agents in its (largest) batch."""
     patches: float = 0.0
@@ -136,18 +138,23 @@ class _Batch:
 class _Slot:
     """Thread of forwards, and the batches that it was given: the one in the model, and perhaps the next."""
 
-    def __init__(self, number: int, worker: Worker | None = None) -> None:
-        self.thread = ThreadPoolExecutor(1, thread_name_prefix=f"forward-{number}")
+    def __init__(self, number: int, width: int, worker: Worker | None = None) -> None:
+        self.thread = ThreadPoolExecutor(
+            1,
+            thread_name_prefix=f"forward-{number}",
+            initializer=torch.set_num_threads,
+            initargs=(width,),
+        )
         self.worker = worker
         """Process in which the thread has forwards run; None: it runs them itself."""
         self.batches: list[_Batch] = []
 
     def forward(
-        self, job: Job, parts: Sequence[Prepared], steps: int, width: int, cutters: Executor
+        self, job: Job, parts: Sequence[Prepared], steps: int, cutters: Executor | None
     ) -> "asyncio.Future[Forwarded]":
         """Give a forward to the thread."""
         run = forward if self.worker is None else self.worker.forward
-        batch = Batch(job.agent_type, job.context, parts, steps, width)
+        batch = Batch(job.agent_type, job.context, parts, steps)
         return asyncio.get_running_loop().run_in_executor(self.thread, run, job.forecaster, batch, cutters)
 
     @property
@@ -164,18 +171,14 @@ class Batcher:
         max_batch_agents: int,
         admission: Admission,
         metrics: Metrics,
-        widths: Sequence[int] = (1,),
-        workers: int = 0,
+        threads: ForwardThreads = ONE_FORWARD,
     ) -> None:
         """
         Args:
             max_batch_agents: max number of agents in one forward.
             admission: admits the calls whose jobs are queued.
             metrics: the metrics that count batches.
-            widths: number of torch threads of a forward that runs alone; if there is a second number, two
-                forwards may run at the same time, with so many each (``torch_threads.forward_widths``).
-            workers: number of processes that run forwards, as many at the same time; 0: threads of this
-                process run them.
+            threads: numbers of forwards at the same time, of their threads, and of processes that run them.
         """
         self._max_batch = max_batch_agents
         self._admission = admission
@@ -183,15 +186,15 @@ class Batcher:
         self._costs = admission.costs
         self._queue: DeadlineQueue[_Entry] = DeadlineQueue(self._costs)
         self._wake = asyncio.Event()
-        self._widths = tuple(widths)
-        self._workers = [Worker(number, self._widths, metrics.worker_deaths.inc) for number in range(workers)]
-        self._slots = [_Slot(number, worker) for number, worker in enumerate(self._workers)] or [
-            _Slot(number) for number in range(len(widths))
+        self._workers = [
+            Worker(number, threads.width, metrics.worker_deaths.inc) for number in range(threads.workers)
+        ]
+        self._slots = [
+            _Slot(number, threads.width, self._workers[number] if self._workers else None)
+            for number in range(threads.forwards)
         ]
         metrics.workers.set_function(lambda: sum(worker.is_ready for worker in self._workers))
-        self._cutters = ThreadPoolExecutor(
-            widths[0], thread_name_prefix="patches", initializer=set_helper_threads
-        )
+        self._cutters = make_cutters(threads.width)
         self._worker: asyncio.Task[None] | None = None
         self._crashed = False
         self._on_crash: Callable[[], None] | None = None
@@ -234,7 +237,8 @@ class Batcher:
             await asyncio.to_thread(slot.thread.shutdown)
         for worker in self._workers:
             await asyncio.to_thread(worker.close)
-        self._cutters.shutdown()
+        if self._cutters is not None:
+            self._cutters.shutdown()
 
     async def run(self, jobs: Sequence[Job], call: Call) -> list[Outcome]:
         """Run the jobs of a call, of any forecasters and types.
@@ -274,22 +278,14 @@ class Batcher:
         return [combine([entry.done.result() for entry in part]) for part in parts]
 
     async def run_in_model_threads(self, job: Job) -> float:
-        """Run a job past the queue once with each number of threads, for warm-up, and learn its duration.
-
-        A large one only runs with all threads: beside another forward batches are smaller.
+        """Run a job past the queue in each process of the forward, for warm-up, and learn its duration.
 
         Returns:
             The seconds of the slowest forward.
         """
-        slowest = 0.0
-        for width in self._widths:
-            # Threads share what a forward allocates and compiles; processes do not
-            apart = [slot for slot in self._slots if slot.worker is not None and slot.worker.is_ready]
-            slots = apart or self._slots[:1]
-            if slowest < MAX_BATCH_SECONDS:
-                for slot in slots:
-                    slowest = max(slowest, (await self._run_alone(job, slot, width)).inference)
-        return slowest
+        # Threads share what a forward allocates and compiles; processes do not
+        apart = [slot for slot in self._slots if slot.worker is not None and slot.worker.is_ready]
+        return max([(await self._run_alone(job, slot)).inference for slot in apart or self._slots[:1]])
 
     @property
     def is_free(self) -> bool:
@@ -318,12 +314,12 @@ class Batcher:
 
     async def run_spare(self, job: Job) -> Outcome:
         """Run a job past the queue. The caller waits until ``is_free``, and counts the work."""
-        return await self._run_alone(job, self._slots[-1], self._widths[-1], usual=False)
+        return await self._run_alone(job, self._slots[-1], usual=False)
 
-    async def _run_alone(self, job: Job, slot: _Slot, width: int, usual: bool = True) -> Outcome:
-        done = await slot.forward(job, [job.inputs], job.steps, width, self._cutters)
+    async def _run_alone(self, job: Job, slot: _Slot, usual: bool = True) -> Outcome:
+        done = await slot.forward(job, [job.inputs], job.steps, self._cutters)
         self._costs.measure(job.key, job.agents, done.seconds, usual=usual)
-        return Outcome(done.mixture, 0.0, done.seconds, job.agents, done.patches)
+        return Outcome(done.mixture, done.started, done.seconds, job.agents, done.patches)
 
     def forget(self, forecasters: Iterable[Forecaster]) -> None:
         """Forget models that are gone, and how long their forwards take."""
@@ -338,16 +334,23 @@ class Batcher:
         return await asyncio.get_running_loop().run_in_executor(self._slots[0].thread, function, *arguments)
 
     def _entries(self, job: Job, call: Call) -> list[_Entry]:
-        """Return the job in parts that fit a batch."""
+        """Return the job in parts that fit a batch; if nothing else waits, one for each free forward."""
         queued = time.perf_counter()
         entries = []
-        size = self._costs.batch_agents(job.key, self._max_batch)
+        free = 0 if self._queue else len(self._idle)
+        share = self._share(job.key, job.agents, free)
+        size = min(self._costs.batch_agents(job.key, self._max_batch), share)
         for start in range(0, job.agents, size):
             stop = min(start + size, job.agents)
             whole = stop - start == job.agents
             inputs = job.inputs if whole else job.inputs[start:stop]
             entries.append(_Entry(job, inputs, stop - start, call, queued))
         return entries
+
+    def _share(self, key: Hashable, agents: int, free: int) -> int:
+        """Return the number of agents for each of the free forwards; few agents are all for one of them."""
+        parts = min(free, int(self._costs.seconds(key, agents) / _PART_SECONDS))
+        return max(-(-agents // max(parts, 1)), 1)
 
     def _withdraw(self, entries: Sequence[_Entry]) -> None:
         """Remove a call's entries from the queue, in whatever state they are."""
@@ -360,6 +363,10 @@ class Batcher:
     def _batches(self) -> list[_Batch]:
         return [batch for slot in self._slots for batch in slot.batches]
 
+    @property
+    def _idle(self) -> list[_Slot]:
+        return [slot for slot in self._slots if not slot.batches]
+
     async def _work(self) -> None:
         """Give batches to slots as long as work is queued and a slot is free or about to be."""
         loop = asyncio.get_running_loop()
@@ -369,31 +376,32 @@ class Batcher:
             self._wake.clear()
             if timer is not None:
                 timer.cancel()
-            while self._queue and (slot := self._free_slot()):
-                entries = self._take_batch(max(loop.time(), slot.until))
-                if entries:
-                    self._start(slot, entries)
+            while self._queue and (slots := self._free_slots()):
+                share = self._share(next(iter(self._queue)).key, self._queue.agents, len(slots))
+                for slot in slots:
+                    entries = self._take_batch(max(loop.time(), slot.until), min(share, self._max_batch))
+                    if entries:
+                        self._start(slot, entries)
             first = self._first_busy()
             if self._queue and first is not None and first.until - _AHEAD_SECONDS > loop.time():
                 timer = loop.call_at(first.until - _AHEAD_SECONDS, self._wake.set)
             # Behind that time nothing changes until work comes or a forward ends, and both wake this task
 
-    def _free_slot(self) -> _Slot | None:
-        """Return the slot for the next batch; None: it waits.
+    def _free_slots(self) -> list[_Slot]:
+        """Return the slots for the next batches; none: they wait.
 
         A forward of a few agents beside another one, or right behind it, only starts if it ends before the
         other: at the end of that more of them will have come, and a shared forward takes less time than two.
         """
-        idle = next((slot for slot in self._slots if not slot.batches), None)
-        first = self._first_busy()
+        idle, first = self._idle, self._first_busy()
         if first is None:
             return idle
         now = asyncio.get_running_loop().time()
         if self._queue.agents >= min(_MANY_AGENTS, self._max_batch):
             ahead = len(first.batches) == 1 and now >= first.until - _AHEAD_SECONDS
-            return idle or (first if ahead else None)
+            return idle or ([first] if ahead else [])
         entry = next(iter(self._queue))
-        return idle if now + self._costs.seconds(entry.key, entry.agents) < first.until else None
+        return idle[:1] if now + self._costs.seconds(entry.key, entry.agents) < first.until else []
 
     def _first_busy(self) -> _Slot | None:
         """Return the busy slot that needs its next batch first; None: all are free."""
@@ -401,9 +409,8 @@ class Batcher:
         return min(busy, key=lambda slot: (len(slot.batches), slot.until), default=None)
 
     def _start(self, slot: _Slot, entries: list[_Entry]) -> None:
-        """Give a batch to a slot; its forward has all cores if it is alone, else a part of them."""
+        """Give a batch to a slot."""
         loop = asyncio.get_running_loop()
-        width = self._widths[-1 if self._batches or self._queue else 0]
         batch = _Batch(entries, time.perf_counter(), max(loop.time(), slot.until))
         batch.until += self._costs.seconds(entries[0].key, batch.agents)
         slot.batches.append(batch)
@@ -412,7 +419,7 @@ class Batcher:
         steps = max(entry.job.steps for entry in entries)
         parts = [entry.inputs for entry in entries]
         # Not in the task, which begins only after all that the event loop has to do now
-        running = slot.forward(job, parts, steps, width, self._cutters)
+        running = slot.forward(job, parts, steps, self._cutters)
         batch.task = asyncio.create_task(self._finish(slot, batch, running), name="forward")
         batch.task.add_done_callback(self._check)
 
@@ -461,13 +468,14 @@ class Batcher:
         if self._on_crash is not None:
             self._on_crash()
 
-    def _take_batch(self, start: float) -> list[_Entry]:
+    def _take_batch(self, start: float, max_agents: int) -> list[_Entry]:
         """Take the most urgent batch, and fail the entries that would be late.
 
         Args:
             start: time on the event loop's clock when its forward can start.
+            max_agents: max number of its agents, unless a single entry has more.
         """
-        batch, late, departure = self._queue.take_batch(start, self._max_batch)
+        batch, late, departure = self._queue.take_batch(start, max_agents)
         for entry in late:
             self._metrics.refused.labels("dropped").inc()
             entry.done.set_exception(DeadlineExceeded())
@@ -515,6 +523,8 @@ def combine(outcomes: Sequence[Outcome]) -> Outcome:
     if len(outcomes) == 1:
         return outcomes[0]
     mixtures = [outcome.mixture for outcome in outcomes]
+    inference = seconds_in_model(outcomes)
+    cut = sum(outcome.patches for outcome in outcomes) / sum(outcome.inference for outcome in outcomes)
     mixture = TrajectoryMixture(
         torch.cat([m.log_weights for m in mixtures]),
         torch.cat([m.means for m in mixtures]),
@@ -524,7 +534,16 @@ def combine(outcomes: Sequence[Outcome]) -> Outcome:
     return Outcome(
         mixture,
         min(outcome.queue for outcome in outcomes),
-        sum(outcome.inference for outcome in outcomes),
+        inference,
         max(outcome.batch_agents for outcome in outcomes),
-        sum(outcome.patches for outcome in outcomes),
+        cut * inference,
     )
+
+
+def seconds_in_model(outcomes: Iterable[Outcome]) -> float:
+    """Return the seconds in which at least one of the batches was in the model."""
+    seconds, until = 0.0, -math.inf
+    for start, duration in sorted((outcome.queue, outcome.inference) for outcome in outcomes):
+        seconds += max(start + duration - max(start, until), 0.0)
+        until = max(until, start + duration)
+    return seconds

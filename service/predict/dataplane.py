@@ -22,7 +22,7 @@ from service.predict.rasters.library import RasterLibrary
 from service.predict.rasters.shared import SharedRasters
 from service.predict.reload import Load, Reloader
 from service.predict.shadow import Shadow
-from service.predict.torch_threads import forward_widths, set_helper_threads, worker_count
+from service.predict.torch_threads import forward_threads, set_helper_threads
 from service.recording.factory import make_recorder
 from service.scenes.fanout import FrameFanout
 from service.scenes.live import LiveScenes
@@ -59,8 +59,7 @@ class DataPlane:
             settings.max_batch_agents,
             self._admission,
             metrics,
-            forward_widths(settings.threads, settings.workers),
-            worker_count(settings.workers, settings.threads),
+            forward_threads(settings.threads, settings.workers),
         )
         self._threads = ThreadPoolExecutor(
             min(_MAX_WORKERS, whole_cores() + 1),

@@ -12,6 +12,7 @@ from model.arrays import Floats, Ints
 from model.metrics.offroad import off_road
 from model.mixture import TrajectoryMixture
 from model.scenes.scene import STEP_SECONDS, Raster
+from service.predict.batcher import seconds_in_model
 from service.predict.catalog import reference
 from service.predict.plan import Group, Plan
 from service.predict.request import Options
@@ -41,7 +42,7 @@ def encode(plan: Plan, seed: int) -> pb.PredictResponse:
     )
     outcomes = [group.outcome for group in plan.groups if group.outcome is not None]
     response.timing.queue = min((outcome.queue for outcome in outcomes), default=0.0)
-    response.timing.inference = sum(outcome.inference for outcome in outcomes)
+    response.timing.inference = seconds_in_model(outcomes)
     response.timing.batch_agents = max((outcome.batch_agents for outcome in outcomes), default=0)
 
     forecasts: dict[int, pb.AgentForecast] = {}

@@ -38,17 +38,15 @@ class Batch(NamedTuple):
     """The context that the parts were prepared with."""
     parts: Sequence[Prepared]
     steps: int
-    width: int
-    """Number of threads of the forward."""
 
 
-def forward(forecaster: Forecaster, batch: Batch, cutters: Executor) -> Forwarded:
+def forward(forecaster: Forecaster, batch: Batch, cutters: Executor | None = None) -> Forwarded:
     """Run one forward of a forecaster over the joined parts of a batch.
 
     Args:
         forecaster: the forecaster.
         batch: the batch.
-        cutters: threads that cut map patches; with one thread the forward's own cuts them.
+        cutters: threads that cut map patches of many agents; None: the calling one does.
 
     Returns:
         The mixture and the time that it took.
@@ -57,11 +55,9 @@ def forward(forecaster: Forecaster, batch: Batch, cutters: Executor) -> Forwarde
         RuntimeError: the mixture is not one of the expected agents, modes and steps.
     """
     started = time.perf_counter()
-    if torch.get_num_threads() != batch.width:
-        torch.set_num_threads(batch.width)
     with torch.inference_mode():
         agents = sum(map(len, batch.parts))
-        features = complete(batch.parts, cutters if batch.width > 1 and agents >= _CUT_IN_THREADS else None)
+        features = complete(batch.parts, cutters if agents >= _CUT_IN_THREADS else None)
         patches = time.perf_counter() - started
         mixture = forecaster.forecast(features, batch.agent_type, batch.context, batch.steps)
     require_shapes(forecaster.info, mixture, agents, batch.steps)

@@ -18,6 +18,7 @@ from cab.forecast.v1 import prediction_service_pb2 as predict_pb
 from cab.forecast.v1 import scene_service_pb2 as pb
 from model.arrays import Floats
 from model.scenes.scene import STEP_SECONDS, AgentStates
+from service.predict.batcher import seconds_in_model
 from service.predict.catalog import reference
 from service.predict.encode import TRIANGLE, softmax
 from service.predict.plan import Group, Plan
@@ -75,7 +76,7 @@ def build_frame(
         "model": model_document(reference(plan.forecaster.info)),
         "shadow": shadow,
         "map_digest": base64.b64encode(map_digest).decode(),
-        "inference_seconds": sum(outcome.inference for outcome in outcomes),
+        "inference_seconds": seconds_in_model(outcomes),
         "queue_seconds": min((outcome.queue for outcome in outcomes), default=0.0),
         "steps": plan.options.steps,
         "step": STEP_SECONDS,

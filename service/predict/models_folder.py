@@ -15,7 +15,7 @@ from model.explanation.donors import Donors, DonorsError, load_donors
 from model.forecaster import Forecaster, ModelInfo, Protocol
 from model.registry import DuplicateModelError, Registry, baselines, checkpoint_folders
 from service.predict.canary import check
-from service.predict.torch_threads import forward_widths
+from service.predict.torch_threads import forward_threads
 from service.settings import Engine, Settings, SettingsError, bundled_models
 
 _log = structlog.get_logger(__name__)
@@ -204,7 +204,7 @@ def _load(folder: Path, config: str, settings: Settings) -> Source:
         return Source(config, info, weights, None)
     forecaster = checkpoint.forecaster()
     if settings.engine is Engine.ONNXRUNTIME:
-        forecaster.compile(forward_widths(settings.threads, settings.workers))
+        forecaster.compile(forward_threads(settings.threads, settings.workers).width)
     check(forecaster)
     return Source(config, info, weights, forecaster)
 

@@ -7,6 +7,8 @@ cores.
 """
 
 import os
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import torch
 
@@ -16,37 +18,46 @@ _CORES = torch.get_num_threads()
 """torch's choice when the process starts: the physical cores."""
 
 
-def forward_widths(threads: int | None, workers: int | None = None) -> tuple[int, ...]:
-    """Return the number of threads of a forward that runs alone, and of each of several at the same time.
+_MAX_WORKERS = 4
+"""Number of workers by default, at most: each takes some 330 MiB."""
 
-    Two forwards of half the cores each finish more than one after the other with all: the threads of one
-    never wait for each other while other work of the server has a core. With one thread there is no second
-    number.
+
+class ForwardThreads(NamedTuple):
+    """Numbers of forwards that may run at the same time, and of their threads."""
+
+    forwards: int
+    """Forwards at the same time."""
+    width: int
+    """Threads of each."""
+    workers: int
+    """Processes that run them, as many as forwards; 0: threads of the server's process do."""
+
+
+ONE_FORWARD = ForwardThreads(1, 1, 0)
+
+
+def forward_threads(threads: int | None = None, workers: int | None = None) -> ForwardThreads:
+    """Return how forwards share the cores.
+
+    Several forwards with few threads each finish more than one with all: threads of one forward wait for each
+    other after each of its hundreds of short sections.
 
     Args:
-        threads: the setting; None: as many as the quota allows, at most one for each physical core. More
-            threads than a CPU quota allows would use it up early in each period and then stand still
-            together.
-        workers: as in ``worker_count``; without workers, two threads of this process run forwards.
+        threads: threads of all forwards together; None: as many as the quota allows, at most one for each
+            physical core. More threads than a CPU quota allows would use it up early in each period and then
+            stand still together.
+        workers: number of processes; None: one for each thread, at most four, if there are two threads and
+            the system has what processes share.
     """
-    alone = _threads(threads)
-    return (alone,) if alone == 1 else (alone, max(1, alone // (worker_count(workers, threads) or 2)))
-
-
-def worker_count(workers: int | None, threads: int | None) -> int:
-    """Return the number of processes that run forwards; 0: threads of this process do.
-
-    Args:
-        workers: the setting; None: two, if a forward has two threads and the system has what they share.
-        threads: as in ``forward_widths``.
-    """
-    if workers is not None:
-        return workers
-    return 2 if _threads(threads) > 1 and hasattr(os, "memfd_create") else 0
+    total = _threads(threads)
+    if workers is None:
+        workers = min(total, _MAX_WORKERS) if total > 1 and hasattr(os, "memfd_create") else 0
+    forwards = workers or min(total, 2)
+    return ForwardThreads(forwards, max(1, total // forwards), workers)
 
 
 def _threads(threads: int | None) -> int:
-    """Return the number of threads of a forward that runs alone."""
+    """Return the number of threads of all forwards together."""
     if threads is not None:
         return threads
     limited = usable_cores() < len(os.sched_getaffinity(0))
@@ -56,3 +67,10 @@ def _threads(threads: int | None) -> int:
 def set_helper_threads() -> None:
     """Make the calling thread compute without a team."""
     torch.set_num_threads(1)
+
+
+def make_cutters(width: int) -> ThreadPoolExecutor | None:
+    """Return threads that cut map patches for forwards of so many threads; None: the forward's own does."""
+    if width == 1:
+        return None
+    return ThreadPoolExecutor(width, thread_name_prefix="patches", initializer=set_helper_threads)

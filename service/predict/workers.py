@@ -20,8 +20,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from collections.abc import Callable, Iterable
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -38,7 +38,7 @@ from model.networks.config import AnyNetworkConfig
 from model.networks.forecaster import NetworkForecaster
 from service.predict.canary import straight_scene
 from service.predict.forward import Batch, Forwarded, forward
-from service.predict.torch_threads import set_helper_threads
+from service.predict.torch_threads import make_cutters
 
 _log = structlog.get_logger(__name__)
 
@@ -47,6 +47,9 @@ ARENA_BYTES = 32 * 2**20
 memory only where it has been written."""
 _COMMAND = f"from {__name__} import main; main()"
 """Python code of a worker. With ``-m`` the classes of messages would be defined twice in it."""
+_ALLOCATION = {"MALLOC_MMAP_THRESHOLD_": str(2**30), "MALLOC_TRIM_THRESHOLD_": str(2**30)}
+"""Environment in which glibc keeps freed memory. It would give that of each forward back to the system, and
+the next forward would find a thousand pages missing: 3 of 25 ms with 32 agents."""
 _END_SECONDS = 2.0
 """Seconds that a worker gets to end by itself."""
 _FIRST_PAUSE, _MAX_PAUSE = 0.5, 60.0
@@ -72,8 +75,8 @@ class _Load:
     info: ModelInfo
     network: AnyNetworkConfig
     tensors: dict[str, torch.Tensor]
-    widths: tuple[int, ...]
-    """Numbers of threads that its native forward may have; empty: it runs in PyTorch."""
+    is_compiled: bool
+    """True if its forward is a native call; else it runs in PyTorch."""
     max_batch: int
     """Number of agents of the largest first forward."""
 
@@ -169,13 +172,13 @@ class Worker:
 
     Args:
         number: number of the worker, for the log.
-        widths: numbers of threads that its forwards may have.
+        width: number of threads of its forwards.
         on_death: called in some thread when a process has died.
     """
 
-    def __init__(self, number: int, widths: tuple[int, ...], on_death: Callable[[], None]) -> None:
+    def __init__(self, number: int, width: int, on_death: Callable[[], None]) -> None:
         self._number = number
-        self._widths = widths
+        self._width = width
         self._on_death = on_death
         self._lock = threading.Lock()
         self._models: dict[int, _Load] = {}
@@ -209,7 +212,7 @@ class Worker:
                 self._loading(forecaster, max_batch if forecaster is default else _SCENE_AGENTS)
         self._start_in_thread(0.0)
 
-    def forward(self, forecaster: Forecaster, batch: Batch, cutters: Executor) -> Forwarded:
+    def forward(self, forecaster: Forecaster, batch: Batch, cutters: Executor | None = None) -> Forwarded:
         """Run a forward in the process if there is one and the forecaster is a network, else here.
 
         Args and result are those of ``forward.forward``.
@@ -255,9 +258,11 @@ class Worker:
         key = id(forecaster)
         with self._lock:
             if key not in self._models:
-                widths = self._widths if forecaster.is_compiled else ()
                 tensors = dict(forecaster.networks.state_dict())
-                self._models[key] = _Load(key, forecaster.info, forecaster.config, tensors, widths, max_batch)
+                compiled = forecaster.is_compiled
+                self._models[key] = _Load(
+                    key, forecaster.info, forecaster.config, tensors, compiled, max_batch
+                )
             return self._models[key]
 
     def _live_process(self) -> "_Process | None":
@@ -287,7 +292,7 @@ class Worker:
         """Start a process after a pause, and use it once it has loaded the models."""
         if self._closed.wait(pause):
             return
-        process = _Process(self._widths[0])
+        process = _Process(self._width)
         try:
             while not self._closed.is_set():
                 with self._lock:  # models may come and go while others are loaded
@@ -312,10 +317,10 @@ class Worker:
 class _Process:
     """A running worker process, and the models that it has loaded."""
 
-    def __init__(self, threads: int) -> None:
+    def __init__(self, width: int) -> None:
         """
         Args:
-            threads: number of threads that cut map patches.
+            width: number of threads of a forward.
         """
         ours, theirs = socket.socketpair()
         memory = [os.memfd_create(f"forecast-{name}", os.MFD_CLOEXEC) for name in ("parts", "mixtures")]
@@ -324,8 +329,9 @@ class _Process:
                 os.ftruncate(one, ARENA_BYTES)
             numbers = [theirs.fileno(), *memory]
             self._process = subprocess.Popen(  # noqa: S603 (our own module)
-                [sys.executable, "-c", _COMMAND, *map(str, numbers), str(threads)],
+                [sys.executable, "-c", _COMMAND, *map(str, numbers), str(width)],
                 pass_fds=numbers,
+                env=os.environ | _ALLOCATION,
                 stdin=subprocess.DEVNULL,
             )
             self._channel = SharedChannel(Connection(ours.detach()), *memory)
@@ -403,8 +409,10 @@ class _Process:
 class _Models:
     """The models of a worker process, and what it does with them."""
 
-    def __init__(self, cutters: Executor) -> None:
-        self._cutters = cutters
+    def __init__(self, width: int) -> None:
+        torch.set_num_threads(width)
+        self._width = width
+        self._cutters = make_cutters(width)
         self._forecasters: dict[int, Forecaster] = {}
 
     def answer(self, message: _Message) -> object:
@@ -415,45 +423,43 @@ class _Models:
             # Parameters outlive the message, whose memory is written anew
             tensors = {name: tensor.clone() for name, tensor in message.tensors.items()}
             forecaster = Checkpoint(Path(), message.info, message.network, tensors).forecaster()
-            if message.widths:
-                forecaster.compile(message.widths)
-            self._warm_up(forecaster, message.widths or (torch.get_num_threads(),), message.max_batch)
+            if message.is_compiled:
+                forecaster.compile(self._width)
+            self._warm_up(forecaster, message.max_batch)
             self._forecasters[message.key] = forecaster
         else:
             for key in message.keys:
                 self._forecasters.pop(key, None)
         return None
 
-    def _warm_up(self, forecaster: Forecaster, widths: Sequence[int], max_batch: int) -> None:
+    def _warm_up(self, forecaster: Forecaster, max_batch: int) -> None:
         """Run the first forwards, which allocate and cache, before a call waits for one."""
         info = forecaster.info
         for agent_type in info.agent_types:
             scene = straight_scene(agent_type, info.history_frames, [_SPEED] * max_batch)
             for context in info.contexts:
                 whole = forecaster.view(scene, np.arange(max_batch), context)
-                for width in widths:
-                    for agents in {min(_SCENE_AGENTS, max_batch), max_batch}:
-                        batch = Batch(agent_type, context, [whole[:agents]], info.steps, width)
-                        forward(forecaster, batch, self._cutters)
+                for agents in {min(_SCENE_AGENTS, max_batch), max_batch}:
+                    batch = Batch(agent_type, context, [whole[:agents]], info.steps)
+                    forward(forecaster, batch, self._cutters)
 
 
 def main() -> None:
     """Run a worker: answer messages until the server closes the socket."""
-    connection, incoming, outgoing, threads = map(int, sys.argv[1:5])
+    connection, incoming, outgoing, width = map(int, sys.argv[1:5])
     # Signals to the whole group are for the server, which still needs its workers while it drains
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     channel = SharedChannel(Connection(connection), outgoing, incoming)
-    with ThreadPoolExecutor(threads, "patches", initializer=set_helper_threads) as cutters:
-        models = _Models(cutters)
-        while True:
-            try:
-                message: _Message = channel.receive()
-            except (EOFError, OSError):
-                os._exit(0)  # at once: there is nothing to save, and libraries take a second to end
-            answer: object
-            try:
-                answer = models.answer(message)
-            except Exception as error:  # the server reports it for the calls of the batch
-                answer = RuntimeError(f"{type(error).__name__}: {error}")
-            channel.send(answer)
+    models = _Models(width)
+    while True:
+        try:
+            message: _Message = channel.receive()
+        except (EOFError, OSError):
+            os._exit(0)  # at once: there is nothing to save, and libraries take a second to end
+        answer: object
+        try:
+            answer = models.answer(message)
+        except Exception as error:  # the server reports it for the calls of the batch
+            answer = RuntimeError(f"{type(error).__name__}: {error}")
+        channel.send(answer)

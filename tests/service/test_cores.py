@@ -7,7 +7,7 @@ import pytest
 
 from service.cores import usable_cores, whole_cores
 from service.predict import torch_threads
-from service.predict.torch_threads import forward_widths
+from service.predict.torch_threads import forward_threads
 
 ALL = len(os.sched_getaffinity(0))
 V2 = "sys/fs/cgroup"
@@ -62,15 +62,29 @@ def test_without_control_groups_all_cores_may_be_used(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("setting", "quota", "expected"),
-    [(None, 2.5, (2, 1)), (None, 0.5, (1,)), (None, 100.0, (4, 2)), (None, 8.0, (4, 2)), (3, 1.0, (3, 1))],
+    ("setting", "workers", "quota", "expected"),
+    [
+        (None, None, 2.5, (2, 1, 2)),
+        (None, None, 0.5, (1, 1, 0)),
+        (None, None, 100.0, (4, 1, 4)),
+        (None, None, 8.0, (4, 1, 4)),
+        (8, None, 1.0, (4, 2, 4)),
+        (3, 0, 1.0, (2, 1, 0)),
+        (None, 0, 8.0, (2, 2, 0)),
+        (None, 3, 8.0, (3, 1, 3)),
+        (1, 2, 8.0, (2, 1, 2)),
+    ],
 )
 def test_a_quota_bounds_the_threads_of_the_forward(
-    monkeypatch: pytest.MonkeyPatch, setting: int | None, quota: float, expected: tuple[int, ...]
+    monkeypatch: pytest.MonkeyPatch,
+    setting: int | None,
+    workers: int | None,
+    quota: float,
+    expected: tuple[int, int, int],
 ) -> None:
     cores = 8 if quota == 8.0 else 128
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
     monkeypatch.setattr(torch_threads, "usable_cores", lambda: quota)
     monkeypatch.setattr(torch_threads, "whole_cores", lambda: max(int(quota), 1))
     monkeypatch.setattr(torch_threads, "_CORES", 4)
-    assert forward_widths(setting) == expected
+    assert forward_threads(setting, workers) == expected

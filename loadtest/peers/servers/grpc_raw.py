@@ -37,7 +37,7 @@ class Predict:
         self._limits = RequestLimits.from_settings(self._settings)
         registry = Registry.load(served.models)
         forecaster = registry.get(served.model)
-        if served.engine != "eager" and forecaster.compile([served.threads or torch.get_num_threads()]):
+        if served.engine != "eager" and forecaster.compile(served.threads or torch.get_num_threads()):
             torch.set_num_threads(1)
         self._catalog = build_catalog(registry, served.model)
 

@@ -75,10 +75,10 @@ def test_architectures_without_a_graph_are_told(config: NetworkConfig) -> None:
 
 def test_a_model_of_another_history_stays_in_pytorch() -> None:
     made = cab_network(Frame.AGENT)
-    assert made.compile([1])
+    assert made.compile(1)
     state = made.networks.state_dict()
     shorter = CvaeForecaster(made.info.model_copy(update={"history_frames": 3}), EVERYTHING, state)
-    assert not shorter.compile([1])
+    assert not shorter.compile(1)
     features = some_features(2)
     features["history"] = features["history"][:, :3]
     features["first"] = torch.zeros(2, dtype=torch.int64)

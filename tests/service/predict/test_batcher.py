@@ -14,7 +14,8 @@ from model.mixture import TrajectoryMixture
 from model.scenes.scene import AgentType
 from service.errors import DeadlineExceeded, Internal, Overloaded, Unavailable
 from service.predict.admission import Admission, Call
-from service.predict.batcher import Batcher, Job, Outcome
+from service.predict.batcher import Batcher, Job, Outcome, seconds_in_model
+from service.predict.torch_threads import ForwardThreads
 from service.telemetry.metrics import Metrics
 from tests.service.fakes import FakeForecaster
 
@@ -354,7 +355,8 @@ async def test_a_crash_beside_another_forward_is_told_once(
     fake: FakeForecaster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     crash = Mock()
-    batcher = Batcher(8, Admission(8, 20, Metrics()), Metrics(), (2, 1))
+    batcher = Batcher(8, Admission(8, 20, Metrics()), Metrics(), ForwardThreads(2, 1, 0))
+    batcher._costs.measure(None, 8, 1e-6)
     batcher.start(crash)
     other = FakeForecaster()
     other.free.clear()
@@ -438,15 +440,13 @@ async def test_threads_of_the_forward() -> None:
             seen.append((torch.get_num_threads(), torch.is_inference_mode_enabled()))
             return super().forecast(*arguments, **named)
 
-    before = torch.get_num_threads()
-    batcher = Batcher(8, Admission(8, 20, Metrics()), Metrics(), (1,))
+    batcher = Batcher(8, Admission(8, 20, Metrics()), Metrics(), ForwardThreads(1, 3, 0))
     batcher.start()
     try:
         await submit(batcher, job(Counting(), 1))
     finally:
         await batcher.stop()
-        torch.set_num_threads(before)
-    assert seen == [(1, True)]
+    assert seen == [(3, True)]
 
 
 async def entered_again(fake: FakeForecaster) -> None:
@@ -455,28 +455,26 @@ async def entered_again(fake: FakeForecaster) -> None:
     fake.entered.clear()
 
 
+async def begun(fake: FakeForecaster, forwards: int) -> None:
+    """Wait until so many forwards have begun."""
+    for _ in range(10_000):
+        if len(fake.batches) >= forwards:
+            return
+        await asyncio.sleep(0.001)
+    pytest.fail(f"{len(fake.batches)} of {forwards} forwards have begun")
+
+
 @pytest.fixture
 async def pair(admission: Admission) -> AsyncIterator[Batcher]:
-    """A batcher with two forwards at a time: four threads for one alone, two for each of two."""
-    before = torch.get_num_threads()
-    made = Batcher(8, admission, Metrics(), (4, 2))
+    """A batcher with two forwards at a time, and forwards that are too short to spread a call over both."""
+    made = Batcher(8, admission, Metrics(), ForwardThreads(2, 1, 0))
+    made._costs.measure(None, 8, 1e-6)
     made.start()
     yield made
     await made.stop()
-    torch.set_num_threads(before)
 
 
-async def test_two_forwards_run_at_the_same_time_and_share_the_threads(
-    pair: Batcher, fake: FakeForecaster, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    threads = []
-    forecast = fake.forecast
-
-    def count(*arguments, **named):  # type: ignore[no-untyped-def]
-        threads.append(torch.get_num_threads())
-        return forecast(*arguments, **named)
-
-    monkeypatch.setattr(fake, "forecast", count)
+async def test_two_forwards_run_at_the_same_time(pair: Batcher, fake: FakeForecaster) -> None:
     calls = []
     for x in (10.0, 20.0):
         calls.append(submit(pair, job(fake, 8, x=x)))
@@ -488,7 +486,57 @@ async def test_two_forwards_run_at_the_same_time_and_share_the_threads(
     fake.free.set()
     origins = [(await call)[0].mixture.origin[:2, 0].tolist() for call in (*calls, third)]
     assert origins == [[10, 11], [20, 21], [30, 31]]
-    assert threads[:2] == [4, 2]
+
+
+async def test_the_free_forwards_share_a_call_that_is_alone(pair: Batcher, fake: FakeForecaster) -> None:
+    pair._costs.measure(job(fake, 1).key, 7, 0.1)
+    call = submit(pair, job(fake, 7, x=10.0))
+    await begun(fake, 2)
+    fake.free.set()
+    [outcome] = await call
+    assert sorted(agents for _, agents, _, _ in fake.batches) == [3, 4]
+    assert outcome.mixture.origin[:, 0].tolist() == [10, 11, 12, 13, 14, 15, 16]
+    assert outcome.batch_agents == 4
+
+
+async def test_a_busy_server_does_not_spread_calls(pair: Batcher, fake: FakeForecaster) -> None:
+    pair._costs.measure(job(fake, 1).key, 7, 0.1)
+    first = submit(pair, job(fake, 8))
+    await begun(fake, 2)
+    calls = [submit(pair, job(fake, 4)) for _ in range(2)]
+    await settle()
+    fake.batches.clear()
+    fake.free.set()
+    await asyncio.gather(first, *calls)
+    assert all(agents in (4, 8) for _, agents, _, _ in fake.batches)
+
+
+async def test_calls_that_wait_for_several_free_forwards_are_spread_over_them(
+    pair: Batcher, fake: FakeForecaster
+) -> None:
+    pair._costs.measure(job(fake, 1).key, 3, 1e-6)
+    pair._costs.measure(job(fake, 1).key, 6, 0.1)
+    calls = [submit(pair, job(fake, 3, x=10.0 * number)) for number in range(2)]
+    await begun(fake, 2)
+    fake.free.set()
+    await asyncio.gather(*calls)
+    assert [agents for _, agents, _, _ in fake.batches] == [3, 3]
+
+
+@pytest.mark.parametrize(
+    ("intervals", "seconds"),
+    [
+        ([], 0.0),
+        ([(1.0, 2.0)], 2.0),
+        ([(1.0, 2.0), (1.5, 1.0)], 2.0),
+        ([(4.0, 1.0), (1.0, 2.0), (2.0, 2.0)], 4.0),
+        ([(5.0, 1.0), (1.0, 2.0)], 3.0),
+    ],
+)
+def test_time_in_the_model_counts_once(intervals: list[tuple[float, float]], seconds: float) -> None:
+    mixture = Mock()
+    outcomes = [Outcome(mixture, start, duration, 1) for start, duration in intervals]
+    assert seconds_in_model(outcomes) == pytest.approx(seconds)
 
 
 async def test_admission_knows_when_a_forward_ends_only_if_all_are_taken(
@@ -525,11 +573,11 @@ async def test_a_failed_forward_leaves_the_other_one_alone(pair: Batcher, fake: 
 async def test_few_agents_wait_for_a_forward_that_ends_before_theirs_would(
     pair: Batcher, fake: FakeForecaster, seconds: float, forwards: int
 ) -> None:
-    pair._costs.measure(job(fake, 8).key, 8, seconds)
-    pair._costs.measure(job(fake, 1).key, 1, 1e-3)
-    first = submit(pair, job(fake, 8))
+    pair._costs.measure(job(fake, 1).key, 1, seconds)
+    pair._costs.measure(job(fake, 1, PEDESTRIAN).key, 1, 1e-2)
+    first = submit(pair, job(fake, 1))
     await entered_again(fake)
-    small = submit(pair, job(fake, 1))
+    small = submit(pair, job(fake, 1, PEDESTRIAN))
     if forwards == 2:
         await entered_again(fake)
     await settle()
@@ -538,17 +586,17 @@ async def test_few_agents_wait_for_a_forward_that_ends_before_theirs_would(
     await asyncio.gather(first, small)
 
 
-@pytest.mark.parametrize("widths", [(1,), (2, 1)])
+@pytest.mark.parametrize("forwards", [1, 2])
 async def test_the_event_loop_rests_while_few_agents_wait(
-    fake: FakeForecaster, monkeypatch: pytest.MonkeyPatch, widths: tuple[int, ...]
+    fake: FakeForecaster, monkeypatch: pytest.MonkeyPatch, forwards: int
 ) -> None:
-    batcher = Batcher(32, Admission(32, 64, Metrics()), Metrics(), widths)
+    batcher = Batcher(32, Admission(32, 64, Metrics()), Metrics(), ForwardThreads(forwards, 1, 0))
     batcher.start()
     first = await hold(batcher, fake)
     second = submit(batcher, job(fake, 1))
     await settle()
-    look = Mock(side_effect=batcher._free_slot)
-    monkeypatch.setattr(batcher, "_free_slot", look)
+    look = Mock(side_effect=batcher._free_slots)
+    monkeypatch.setattr(batcher, "_free_slots", look)
     await asyncio.sleep(0.05)  # longer than the forward was expected to take
     assert look.call_count <= 2
     fake.free.set()
@@ -557,7 +605,7 @@ async def test_the_event_loop_rests_while_few_agents_wait(
     await batcher.stop()
 
 
-async def test_warm_up_runs_with_each_number_of_threads(pair: Batcher, fake: FakeForecaster) -> None:
+async def test_warm_up_runs_once_for_all_threads(pair: Batcher, fake: FakeForecaster) -> None:
     fake.free.set()
     await pair.run_in_model_threads(job(fake, 3))
-    assert [agents for _, agents, _, _ in fake.batches] == [3, 3]
+    assert [agents for _, agents, _, _ in fake.batches] == [3]

@@ -25,7 +25,6 @@ from tests.service.fakes import FakeForecaster
 
 VEHICLE = AgentType.VEHICLE
 SECONDS = 60.0
-CUTTERS = ThreadPoolExecutor(1)
 
 
 def bundled(name: str) -> NetworkForecaster:  # type: ignore[type-arg]
@@ -39,7 +38,7 @@ def bundled(name: str) -> NetworkForecaster:  # type: ignore[type-arg]
 @pytest.fixture(scope="module")
 def cab() -> Forecaster:
     made = bundled("cab")
-    made.compile((1,))
+    made.compile(1)
     return made
 
 
@@ -50,7 +49,7 @@ def deaths() -> list[int]:
 
 @pytest.fixture
 def worker(deaths: list[int]) -> Iterator[Worker]:
-    made = Worker(0, (1,), lambda: deaths.append(1))
+    made = Worker(0, 1, lambda: deaths.append(1))
     yield made
     made.close()
 
@@ -69,7 +68,7 @@ def parts_of(forecaster: Forecaster, speeds: list[float], context: Context = Con
 
 
 def run(worker: Worker, forecaster: Forecaster, parts: list[Prepared]) -> Forwarded:
-    return worker.forward(forecaster, Batch(VEHICLE, Context.FULL, parts, 12, 1), CUTTERS)
+    return worker.forward(forecaster, Batch(VEHICLE, Context.FULL, parts, 12))
 
 
 def kill(worker: Worker) -> int:
@@ -137,7 +136,7 @@ def test_the_other_end_of_a_closed_channel_ends(channels: tuple[SharedChannel, S
 def test_a_worker_forecasts_as_the_server_does(worker: Worker, cab: Forecaster) -> None:
     worker.start([cab], cab, 16)
     parts = [*parts_of(cab, [0.0, 5.0, 9.0]), *parts_of(cab, [12.0])]
-    here = forward(cab, Batch(VEHICLE, Context.FULL, parts, 12, 1), CUTTERS)
+    here = forward(cab, Batch(VEHICLE, Context.FULL, parts, 12))
     before = run(worker, cab, parts)  # the process starts only now, so this ran here
     until(lambda: worker.is_ready)
     there = run(worker, cab, parts)
@@ -221,7 +220,7 @@ def test_a_worker_that_dies_between_forwards_costs_none(
 
 
 def test_a_worker_ends_with_its_server(cab: Forecaster) -> None:
-    made = Worker(0, (1,), lambda: None)
+    made = Worker(0, 1, lambda: None)
     made.start([cab], cab, 16)
     until(lambda: made.is_ready)
     pid = made.pid
@@ -235,7 +234,7 @@ def test_a_worker_ends_with_its_server(cab: Forecaster) -> None:
 
 
 def test_a_worker_that_is_closed_while_it_starts_leaves_no_process(cab: Forecaster) -> None:
-    made = Worker(0, (1,), lambda: None)
+    made = Worker(0, 1, lambda: None)
     made.start([cab], cab, 16)
     made.close()
     assert not made.is_ready
