@@ -316,12 +316,13 @@ def _row(model: ComparedModel, one: Difference) -> tuple[str, ...]:
         number(one.b, 3),
         signed(one.difference, 3),
         number(one.standard_error, 3),
-        _interval(one.interval),
+        bounds(one.interval),
         number(one.pairs),
         clear,
     )
 
 
-def _interval(bounds: tuple[float, float]) -> str:
-    low, high = (signed(bound, 3) for bound in bounds)
-    return UNKNOWN if math.isnan(bounds[0]) else f"{low} … {high}"
+def bounds(interval: tuple[float, float]) -> str:
+    """Return an interval of differences as text."""
+    low, high = (signed(bound, 3) for bound in interval)
+    return UNKNOWN if math.isnan(interval[0]) else f"{low} … {high}"

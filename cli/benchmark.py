@@ -26,6 +26,7 @@ def register(app: typer.Typer) -> None:
     group = typer.Typer(help=benchmark.__doc__, invoke_without_command=True)
     group.callback()(with_connection(benchmark))
     group.command("compare")(compare)
+    group.command("seeds")(seeds)
     app.add_typer(group, name="benchmark")
 
 
@@ -168,6 +169,28 @@ def compare(
         typer.echo(markdown(compared(first, second)), nl=False)
     except BenchmarkError as error:
         fail(str(error))
+
+
+def seeds(
+    a: Annotated[str, typer.Argument(metavar="A", help="Name of a model, e.g. trajectron.")],
+    b: Annotated[str, typer.Argument(metavar="B", help="Name of another model, e.g. cab.")],
+    runs: Annotated[
+        list[Path], typer.Argument(metavar="RUN…", help="Results folders, one for each training of A or B.")
+    ],
+) -> None:
+    """Compare two models, each trained with several seeds.
+
+    Differences have 95 % intervals by bootstrap over trainings and scenes (2000 resamples, seed 0).
+    """
+    from benchmark import BenchmarkError
+    from benchmark.seeds import compare_seeds, table
+    from model.evaluation.tables import document
+
+    try:
+        found = compare_seeds(runs, a, b)
+    except BenchmarkError as error:
+        fail(str(error))
+    typer.echo(document("Comparison of two models over seeds", [table(found, a, b)]), nl=False)
 
 
 def _terminal_progress() -> "Progress":

@@ -87,6 +87,9 @@ def test_the_tables_of_a_run_and_of_its_saved_answers(tmp_path: Path, data: str,
     code, compared, said = run("compare", str(out), str(tmp_path / "again"))
     assert code == 0, said
     assert "kalman" in compared
+    code, compared, said = run("seeds", *MODELS.split(","), str(out), str(tmp_path / "again"))
+    assert code == 0, said
+    assert "over 2 and 2 trainings" in compared
 
 
 def test_a_run_that_was_killed_goes_on_to_the_same_result(tmp_path: Path, data: str, server: Server) -> None:
@@ -189,6 +192,7 @@ def test_data_with_tokens_gives_submissions_of_who_answered_it_all(
         (("--data", "{data}", "--out", "{out}", "--endpoint", "127.0.0.1:1"), "the endpoint does not answer"),
         (("--data", "{data}", "--from", "{empty}"), "there are no saved answers"),
         (("compare", "{empty}", "{empty}"), "results.json"),
+        (("seeds", "kalman", "cab", "{empty}"), "results.json"),
         (
             ("--data", "{data}", "--out", "{out}", "--models", "kalman", "--context"),
             "the measures of the context need forecasts of 'trajectron-no-context': ask it, too",
@@ -201,9 +205,9 @@ def test_what_cannot_be_done_is_said(
     (tmp_path / "empty").mkdir()
     places = {"data": data, "out": str(tmp_path / "out"), "empty": str(tmp_path / "empty")}
     given = [argument.format(**places) for argument in arguments]
-    if "--endpoint" not in given and given and given[0] != "compare":
+    if "--endpoint" not in given and given and given[0] not in ("compare", "seeds"):
         given += ["--endpoint", f"grpc://{server.grpc_address}"]
-    if given and given[0] != "compare":
+    if given and given[0] not in ("compare", "seeds"):
         given += ["--timeout", "1"]
     code, shown, errors = run(*given)
     assert code == 1
