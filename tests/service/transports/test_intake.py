@@ -294,7 +294,7 @@ def test_a_full_request_fits_into_the_budget() -> None:
 
 async def test_a_call_over_grpc_is_refused_before_its_request_is_read() -> None:
     fake = FakeForecaster()
-    async with started(fake, max_agents=4, max_queue_agents=4) as server:
+    async with started(fake, workers=0, max_agents=4, max_queue_agents=4) as server:
         fake.free.clear()
         accepted = [asyncio.create_task(call_grpc(server, make_request(4)))]
         await until(fake.entered.is_set)
