@@ -9,12 +9,15 @@ have become late are dropped before they take the model's time.
 import itertools
 from bisect import insort
 from collections.abc import Container, Hashable, Iterator
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Generic, Protocol, TypeVar
 
 _FIRST_RATE = 500.0
 """agents/s; a guess until the first batch has been measured."""
 _SMOOTHING = 0.2
+_STALE = 20
+"""Forwards after which a size that none of them had is expected to be as much slower as the others."""
 MAX_BATCH_SECONDS = 0.05
 """Seconds that a batch may be expected to take, so that a call with a deadline of 100 ms never finds the
 model busy for longer."""
@@ -66,6 +69,51 @@ class Work(Protocol):
 AnyWork = TypeVar("AnyWork", bound=Work)
 
 
+@dataclass
+class _Rate:
+    """Smoothed rate of the forwards of one size, a power of two."""
+
+    first: float
+    """agents/s, the rate of the first one, as if at warm-up."""
+    value: float
+    """agents/s."""
+    forward: int
+    """Number of the last forward of that size."""
+    slowdown: float
+    """Slowdown of all sizes then."""
+
+
+class _Rates:
+    """Rates of the forwards that can be shared, by size.
+
+    A size that has not occurred for long, such as the largest since warm-up, becomes slower as the others do:
+    under load all forwards take longer than at warm-up.
+    """
+
+    def __init__(self) -> None:
+        self._sizes: dict[int, _Rate] = {}
+        self._forwards = 0
+        self._slowdown = 1.0
+
+    def measure(self, agents: int, rate: float) -> None:
+        """Learn from a forward."""
+        self._forwards += 1
+        new = _Rate(rate * self._slowdown, rate, self._forwards, self._slowdown)
+        own = self._sizes.setdefault(agents.bit_length(), new)
+        own.value = self._expected(own)
+        own.value += _SMOOTHING * (rate - own.value)
+        self._slowdown += _SMOOTHING * (own.first / rate - self._slowdown)
+        own.forward, own.slowdown = self._forwards, self._slowdown
+
+    def by_size(self) -> dict[int, float]:
+        """Return the rate of each size that has been measured, agents/s."""
+        return {size: self._expected(own) for size, own in self._sizes.items()}
+
+    def _expected(self, own: _Rate) -> float:
+        stale = own.forward <= self._forwards - _STALE
+        return own.value * own.slowdown / self._slowdown if stale else own.value
+
+
 class CostModel:
     """Smoothed rates of forwards, by the key of what shares them and by size, and the work around them.
 
@@ -74,7 +122,7 @@ class CostModel:
     """
 
     def __init__(self) -> None:
-        self._rates: dict[Hashable, dict[int, float]] = {}
+        self._rates: dict[Hashable, _Rates] = {}
         self._last_key: Hashable = None
         self._around: dict[int, float] = {}
         self.after = 0.0
@@ -95,7 +143,7 @@ class CostModel:
             key: key of the batch's work.
             max_agents: the max number in any case.
         """
-        known = self._rates.get(key) or self._rates.get(self._last_key) or {0: _FIRST_RATE}
+        known = self._known(key)
         largest = max(known)
         # The agents that each rate allows, of a size that has it; larger batches have that of the largest
         fitting = ((size, int(MAX_BATCH_SECONDS * rate)) for size, rate in known.items())
@@ -112,9 +160,7 @@ class CostModel:
             usual: whether the next calls may be expected to need such a forward.
         """
         rate = agents / max(seconds, 1e-6)
-        known = self._rates.setdefault(key, {})
-        size = agents.bit_length()
-        known[size] = known.get(size, rate) + _SMOOTHING * (rate - known.get(size, rate))
+        self._rates.setdefault(key, _Rates()).measure(agents, rate)
         if usual:
             self._last_key = key
 
@@ -158,11 +204,13 @@ class CostModel:
 
     def _rate(self, key: Hashable, agents: int) -> float:
         """Return the rate of the known size that is nearest, the larger one of two."""
-        known = self._rates.get(key) or self._rates.get(self._last_key)
-        if not known:
-            return _FIRST_RATE
-        size = agents.bit_length()
+        known, size = self._known(key), agents.bit_length()
         return known[min(known, key=lambda one: (abs(one - size), -one))]
+
+    def _known(self, key: Hashable) -> dict[int, float]:
+        """Return the rates by size, of another key if nothing is known of that one."""
+        rates = self._rates.get(key) or self._rates.get(self._last_key)
+        return rates.by_size() if rates else {0: _FIRST_RATE}
 
 
 class DeadlineQueue(Generic[AnyWork]):

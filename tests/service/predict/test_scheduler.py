@@ -184,6 +184,35 @@ def test_each_size_has_its_own_rate_and_others_that_of_the_nearest() -> None:
     assert model.batch_agents("new", 1000) == 160
 
 
+def test_a_size_that_does_not_occur_becomes_slower_as_the_others_do() -> None:
+    model = CostModel()
+    model.measure("model", 8, 8 / 1000)
+    model.measure("model", 128, 128 / 2000)
+    assert model.batch_agents("model", 1000) == 100
+    for _ in range(30):  # a busy machine: half as fast as at warm-up
+        model.measure("model", 8, 8 / 500)
+    assert model.seconds("model", 8) == pytest.approx(8 / 500, rel=0.01)
+    assert model.seconds("model", 128) == pytest.approx(128 / 1000, rel=0.01)
+    assert model.batch_agents("model", 1000) == pytest.approx(50, abs=1)
+    model.measure("model", 128, 128 / 1500)
+    assert model.seconds("model", 128) == pytest.approx(128 / 1100, rel=0.01)  # smoothed
+    for _ in range(60):
+        model.measure("model", 8, 8 / 1000)
+    assert model.seconds("model", 128) == pytest.approx(128 / 2000, rel=0.1)
+    assert model.seconds("model", 8) == pytest.approx(8 / 1000, rel=0.01)
+
+
+def test_a_size_that_is_new_under_load_has_the_rate_that_was_measured() -> None:
+    model = CostModel()
+    for rate in (1000, *[500] * 50):
+        model.measure("model", 8, 8 / rate)
+    model.measure("model", 128, 128 / 900)
+    assert model.seconds("model", 128) == pytest.approx(128 / 900)
+    for _ in range(50):
+        model.measure("model", 8, 8 / 500)
+    assert model.seconds("model", 128) == pytest.approx(128 / 900, rel=0.01)
+
+
 def test_a_wrong_estimate_cannot_refuse_for_ever() -> None:
     only = Entry(10.05, 100)
     waiting = queue(only, rate=1.0)
