@@ -38,7 +38,7 @@ _TRIAL_SECONDS = 1.0
 """Seconds between calls that are accepted even if they are expected to be late."""
 _TRANSIT = 0.004
 """Seconds that are left at least for the request and the response on their ways."""
-_TRANSIT_SHARE = 0.02
+_TRANSIT_SHARE = 0.06
 """Share of the time until the deadline that is left for them. Under overload the queue holds as much work as
 deadlines allow, so that every call is finished just before its deadline."""
 _BATCHES_AHEAD = 2
