@@ -14,8 +14,8 @@ from google.protobuf.message import DecodeError, Message
 from cab.forecast.v1.prediction_service_pb2 import PredictRequest, PredictResponse, SceneRaster
 from cab_forecast import predict_request, raster_digest, scene_raster
 from loadtest.forward import paired_seconds
-from loadtest.traffic import START, STEP, Traffic
-from model.arrays import Bytes, Floats
+from loadtest.traffic import FIELD, START, STEP, Traffic
+from model.arrays import Floats
 from model.forecaster import Features, Forecaster, join
 from model.mixture import TrajectoryMixture
 from model.registry import Registry
@@ -27,16 +27,12 @@ SCENES = 8
 """Number of different requests, which calls use in turn."""
 STATES = 5
 """States in an agent's history."""
-PIXELS = 400
+PIXELS = FIELD
 """Rows and columns of the raster, one pixel per metre: the field of the traffic."""
 MAX_POSITION_ERROR = 1e-3
 """m; max difference of a mean, or of the root of a variance, from the forward in process."""
 MAX_WEIGHT_ERROR = 1e-4
 
-_BLOCK = 50
-"""Metres between parallel roads."""
-_ROAD = 12
-"""Width of a road, m."""
 _MIN_RAW_AGENTS = 128
 """Batches of at least so many agents are tried for the best rate of the raw forward."""
 
@@ -93,11 +89,12 @@ def made_up_requests(
     requests = []
     for seed in range(scenes):
         now = START + seed * STEP
+        traffic = Traffic(agents, seed)
         message = predict_request(
             now,
-            Traffic(agents, seed).agents(now, STATES),
+            traffic.agents(now, STATES),
             model=model,
-            raster=scene_raster(_roads(seed), (0.0, 0.0), 1.0),
+            raster=scene_raster(traffic.roads(), (0.0, 0.0), 1.0),
             merge=False,
         )
         requests.append(_encoded(message, encoding, form))
@@ -289,15 +286,3 @@ def _difference(answer: PredictResponse, mixture: TrajectoryMixture) -> str:
     symmetric = covariances[..., [0, 1, 1, 2]].reshape(agents, modes, steps, 2, 2)
     ids = [forecast.agent_id for forecast in answer.forecasts]
     return difference(ids, weights, means, symmetric, mixture)
-
-
-def _roads(seed: int) -> Bytes:
-    """Return a raster of crossing roads with a divider in the middle of each."""
-    layers = np.zeros((3, PIXELS, PIXELS), dtype=np.uint8)
-    for start in range(seed % _BLOCK, PIXELS, _BLOCK):
-        layers[0, start : start + _ROAD] = 1
-        layers[0, :, start : start + _ROAD] = 1
-        middle = min(start + _ROAD // 2, PIXELS - 1)
-        layers[1, middle] = 1
-        layers[2, :, middle] = 1
-    return layers
