@@ -173,8 +173,8 @@ class Settings(BaseSettings):
     quota."""
     workers: int | None = Field(default=None, ge=0, le=256)
     """Number of processes that run forwards, each with an interpreter of its own and its share of the
-    threads; 0: threads of the server's process run them, two at a time. None: one for each thread, at most
-    four; with a single thread 0."""
+    threads; 0: threads of the server's process run them, two at a time. None: two to four, so that no thread
+    is left over; with a single thread 0."""
     engine: Engine = Engine.ONNXRUNTIME
     """Engine of the forward: ``onnxruntime`` runs networks of the agent's frame as one native call and all
     other models in PyTorch; ``eager`` runs all models in PyTorch."""

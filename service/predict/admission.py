@@ -332,7 +332,7 @@ class Admission:
             call = turn.call
             if turn.given.done():
                 continue
-            if call.deadline < now + (0.0 if call.is_trial else self.costs.work(call.agents)):
+            if call.deadline < now + (0.0 if call.is_trial else self.costs.alone(call.agents)):
                 self._metrics.refused.labels("dropped").inc()
                 turn.given.set_exception(DeadlineExceeded())
                 continue
@@ -417,8 +417,10 @@ class Admission:
 
     def _expected(self, order: Order, agents: int, now: float) -> float:
         """Return the expected seconds until a new call is answered."""
-        work = self.costs.work(agents)
         in_model = 0.0 if self.busy_until is None else max(self.busy_until - now, 0.0)
+        if not self._backlog:  # nothing goes first, so free forwards share the call
+            return self.costs.alone(agents) + in_model
+        work = self.costs.work(agents)
         return max(work + in_model, self._backlog.seconds(self._backlog.work_before(order) + work))
 
     def _retry_after(self) -> float:

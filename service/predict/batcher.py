@@ -9,7 +9,7 @@ spread over them. Everything except the forward runs on the event loop, so there
 import asyncio
 import math
 import time
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
@@ -37,8 +37,6 @@ _MANY_AGENTS = 16
 _AHEAD_SECONDS = 0.015
 """Seconds before the end of a forward from which on its thread is given the next batch: the event loop may be
 busy for as long when it ends."""
-_PART_SECONDS = 0.003
-"""Seconds of work that forwards get at least where several could share it: to hand it over takes 0.5 ms."""
 _SPARE_SECONDS = 0.01
 """Seconds that a forward outside the queue may be expected to take."""
 _POLL = 0.002
@@ -184,6 +182,7 @@ class Batcher:
         self._admission = admission
         self._metrics = metrics
         self._costs = admission.costs
+        self._costs.forwards = min(threads.forwards, threads.total)
         self._queue: DeadlineQueue[_Entry] = DeadlineQueue(self._costs)
         self._wake = asyncio.Event()
         self._workers = [
@@ -269,8 +268,7 @@ class Batcher:
                 lag += self._costs.seconds(entry.key, entry.agents)
         self._wake.set()
         try:
-            for entry in entries:
-                await entry.done
+            await asyncio.gather(*(entry.done for entry in entries))
         except BaseException:
             self._withdraw(entries)
             raise
@@ -334,23 +332,20 @@ class Batcher:
         return await asyncio.get_running_loop().run_in_executor(self._slots[0].thread, function, *arguments)
 
     def _entries(self, job: Job, call: Call) -> list[_Entry]:
-        """Return the job in parts that fit a batch; if nothing else waits, one for each free forward."""
+        """Return the job in parts that fit a batch, and that the free forwards share if nothing waits."""
         queued = time.perf_counter()
         entries = []
-        free = 0 if self._queue else len(self._idle)
-        share = self._share(job.key, job.agents, free)
-        size = min(self._costs.batch_agents(job.key, self._max_batch), share)
+        size = self._costs.batch_agents(job.key, self._max_batch)
+        share = self._costs.share(job.key, job.agents, 0 if self._queue else len(self._idle))
+        # If its parts were late, all but one would be dropped, and nothing would be learned of the whole
+        if call.remaining() > self._costs.seconds(job.key, share) + self._costs.after:
+            size = min(size, share)
         for start in range(0, job.agents, size):
             stop = min(start + size, job.agents)
             whole = stop - start == job.agents
             inputs = job.inputs if whole else job.inputs[start:stop]
             entries.append(_Entry(job, inputs, stop - start, call, queued))
         return entries
-
-    def _share(self, key: Hashable, agents: int, free: int) -> int:
-        """Return the number of agents for each of the free forwards; few agents are all for one of them."""
-        parts = min(free, int(self._costs.seconds(key, agents) / _PART_SECONDS))
-        return max(-(-agents // max(parts, 1)), 1)
 
     def _withdraw(self, entries: Sequence[_Entry]) -> None:
         """Remove a call's entries from the queue, in whatever state they are."""
@@ -377,9 +372,9 @@ class Batcher:
             if timer is not None:
                 timer.cancel()
             while self._queue and (slots := self._free_slots()):
-                share = self._share(next(iter(self._queue)).key, self._queue.agents, len(slots))
+                share = self._costs.share(next(iter(self._queue)).key, self._queue.agents, len(slots))
                 for slot in slots:
-                    entries = self._take_batch(max(loop.time(), slot.until), min(share, self._max_batch))
+                    entries = self._take_batch(max(loop.time(), slot.until), share)
                     if entries:
                         self._start(slot, entries)
             first = self._first_busy()
@@ -468,14 +463,15 @@ class Batcher:
         if self._on_crash is not None:
             self._on_crash()
 
-    def _take_batch(self, start: float, max_agents: int) -> list[_Entry]:
+    def _take_batch(self, start: float, share: int) -> list[_Entry]:
         """Take the most urgent batch, and fail the entries that would be late.
 
         Args:
             start: time on the event loop's clock when its forward can start.
-            max_agents: max number of its agents, unless a single entry has more.
+            share: number of agents after which the rest is for other forwards.
         """
-        batch, late, departure = self._queue.take_batch(start, max_agents)
+        others = share if share < self._queue.agents else None
+        batch, late, departure = self._queue.take_batch(start, self._max_batch, others)
         for entry in late:
             self._metrics.refused.labels("dropped").inc()
             entry.done.set_exception(DeadlineExceeded())

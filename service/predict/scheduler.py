@@ -18,6 +18,10 @@ _FIRST_RATE = 500.0
 _SMOOTHING = 0.2
 _STALE = 20
 """Forwards after which a size that none of them had is expected to be as much slower as the others."""
+_MIN_SLOWDOWN = 0.25
+"""Part of its rate that such a size keeps at least."""
+_PART_SECONDS = 0.003
+"""Seconds of work that forwards get at least where several could share it: to hand it over takes 0.5 ms."""
 MAX_BATCH_SECONDS = 0.05
 """Seconds that a batch may be expected to take, so that a call with a deadline of 100 ms never finds the
 model busy for longer."""
@@ -34,6 +38,8 @@ class Departure(StrEnum):
 
     EMPTY = "empty"
     """Nothing else waited that could share its forward."""
+    SHARE = "share"
+    """Other forwards were free for the rest."""
     AGENTS = "agents"
     """It reached the max number of agents."""
     TIME = "time"
@@ -73,45 +79,55 @@ AnyWork = TypeVar("AnyWork", bound=Work)
 class _Rate:
     """Smoothed rate of the forwards of one size, a power of two."""
 
-    first: float
-    """agents/s, the rate of the first one, as if at warm-up."""
+    best: float
+    """agents/s, the highest rate so far."""
     value: float
     """agents/s."""
     forward: int
     """Number of the last forward of that size."""
-    slowdown: float
-    """Slowdown of all sizes then."""
+    speed: float
+    """Speed of all sizes then."""
 
 
 class _Rates:
     """Rates of the forwards that can be shared, by size.
 
-    A size that has not occurred for long, such as the largest since warm-up, becomes slower as the others do:
-    under load all forwards take longer than at warm-up.
+    A size that has not occurred for long, such as the largest since warm-up, becomes slower and faster as the
+    others do: under load all forwards take longer. The speed is the smoothed share of the best rates.
     """
 
     def __init__(self) -> None:
         self._sizes: dict[int, _Rate] = {}
         self._forwards = 0
-        self._slowdown = 1.0
+        self._speed = 1.0
 
     def measure(self, agents: int, rate: float) -> None:
         """Learn from a forward."""
         self._forwards += 1
-        new = _Rate(rate * self._slowdown, rate, self._forwards, self._slowdown)
+        new = _Rate(rate / self._speed, rate, self._forwards, self._speed)
         own = self._sizes.setdefault(agents.bit_length(), new)
         own.value = self._expected(own)
         own.value += _SMOOTHING * (rate - own.value)
-        self._slowdown += _SMOOTHING * (own.first / rate - self._slowdown)
-        own.forward, own.slowdown = self._forwards, self._slowdown
+        own.best = max(own.best, rate)
+        self._speed += _SMOOTHING * (rate / own.best - self._speed)
+        own.forward, own.speed = self._forwards, self._speed
 
-    def by_size(self) -> dict[int, float]:
-        """Return the rate of each size that has been measured, agents/s."""
-        return {size: self._expected(own) for size, own in self._sizes.items()}
+    def of(self, agents: int) -> float:
+        """Return the rate of the known size that is nearest, the larger one of two, agents/s."""
+        size = agents.bit_length()
+        return self._expected(self._sizes[min(self._sizes, key=lambda one: (abs(one - size), -one))])
+
+    def batch_agents(self, seconds: float) -> int:
+        """Return the number of agents of the largest forward that takes so many seconds."""
+        largest = max(self._sizes)
+        # The agents that each rate allows, of a size that has it; larger batches have that of the largest
+        fitting = ((size, int(seconds * self._expected(own))) for size, own in self._sizes.items())
+        return max(agents if size == largest else min(agents, 2**size - 1) for size, agents in fitting)
 
     def _expected(self, own: _Rate) -> float:
-        stale = own.forward <= self._forwards - _STALE
-        return own.value * own.slowdown / self._slowdown if stale else own.value
+        if own.forward > self._forwards - _STALE:
+            return own.value
+        return min(own.value * max(self._speed / own.speed, _MIN_SLOWDOWN), own.best)
 
 
 class CostModel:
@@ -124,6 +140,8 @@ class CostModel:
     def __init__(self) -> None:
         self._rates: dict[Hashable, _Rates] = {}
         self._last_key: Hashable = None
+        self.forwards = 1
+        """Number of forwards that may share a call."""
         self._around: dict[int, float] = {}
         self.after = 0.0
         """Smoothed seconds from the end of a call's last forward until it is answered."""
@@ -144,11 +162,13 @@ class CostModel:
             max_agents: the max number in any case.
         """
         known = self._known(key)
-        largest = max(known)
-        # The agents that each rate allows, of a size that has it; larger batches have that of the largest
-        fitting = ((size, int(MAX_BATCH_SECONDS * rate)) for size, rate in known.items())
-        within = max(agents if size == largest else min(agents, 2**size - 1) for size, agents in fitting)
+        within = known.batch_agents(MAX_BATCH_SECONDS) if known else int(MAX_BATCH_SECONDS * _FIRST_RATE)
         return min(max_agents, max(within, MIN_BATCH_AGENTS))
+
+    def share(self, key: Hashable, agents: int, forwards: int) -> int:
+        """Return the number of agents for each of several free forwards; one of them gets all of a few."""
+        parts = min(forwards, self.forwards, int(self.seconds(key, agents) / _PART_SECONDS))
+        return max(-(-agents // max(parts, 1)), 1)
 
     def measure(self, key: Hashable, agents: int, seconds: float, usual: bool = True) -> None:
         """Learn from a forward.
@@ -198,19 +218,23 @@ class CostModel:
         nearest = min(self._around, key=lambda one: (abs(one - size), -one))
         return self._around[nearest] * min(2.0 ** (size - nearest), 1.0)
 
+    def alone(self, agents: int) -> float:
+        """Return the expected seconds until a call is done that no other keeps waiting: forwards share it."""
+        share = self.share(self._last_key, agents, self.forwards)
+        return self.seconds_of_unknown(share) + self.around(agents)
+
     def work(self, agents: int) -> float:
         """Return the expected seconds of all work for a call, by a model that is not known yet."""
         return self.seconds_of_unknown(agents) + self.around(agents)
 
     def _rate(self, key: Hashable, agents: int) -> float:
         """Return the rate of the known size that is nearest, the larger one of two."""
-        known, size = self._known(key), agents.bit_length()
-        return known[min(known, key=lambda one: (abs(one - size), -one))]
+        known = self._known(key)
+        return known.of(agents) if known else _FIRST_RATE
 
-    def _known(self, key: Hashable) -> dict[int, float]:
-        """Return the rates by size, of another key if nothing is known of that one."""
-        rates = self._rates.get(key) or self._rates.get(self._last_key)
-        return rates.by_size() if rates else {0: _FIRST_RATE}
+    def _known(self, key: Hashable) -> _Rates | None:
+        """Return the rates of a key, those of another one if nothing is known of it."""
+        return self._rates.get(key) or self._rates.get(self._last_key)
 
 
 class DeadlineQueue(Generic[AnyWork]):
@@ -251,7 +275,9 @@ class DeadlineQueue(Generic[AnyWork]):
         """Remove all entries."""
         self._entries.clear()
 
-    def take_batch(self, now: float, max_agents: int) -> tuple[list[AnyWork], list[AnyWork], Departure]:
+    def take_batch(
+        self, now: float, max_agents: int, share: int | None = None
+    ) -> tuple[list[AnyWork], list[AnyWork], Departure]:
         """Take the most urgent entry and what can share its forward, in order.
 
         A batch ends at the first entry of its key that does not fit, which nothing of that key may overtake.
@@ -261,6 +287,7 @@ class DeadlineQueue(Generic[AnyWork]):
         Args:
             now: the time on the clock of the deadlines, s.
             max_agents: the max number of agents in a batch.
+            share: the number of agents after which the rest is for other forwards, which are free.
 
         Returns:
             The batch, the entries that cannot meet their deadlines any more, and why the batch has no more
@@ -276,7 +303,7 @@ class DeadlineQueue(Generic[AnyWork]):
             if entry.deadline < now + self._costs.seconds(entry.key, entry.agents) + self._costs.after:
                 late.append(entry)
             elif batch is None:
-                batch = _Batch(entry, self._costs, now, max_agents)
+                batch = _Batch(entry, self._costs, now, max_agents, share)
             elif not batch.add(entry):
                 rest.append(item)
         self._entries = rest
@@ -292,13 +319,16 @@ class DeadlineQueue(Generic[AnyWork]):
 class _Batch(Generic[AnyWork]):
     """Entries that share a forward."""
 
-    def __init__(self, first: AnyWork, costs: CostModel, now: float, max_agents: int) -> None:
+    def __init__(
+        self, first: AnyWork, costs: CostModel, now: float, max_agents: int, share: int | None
+    ) -> None:
         self.entries = [first]
         self.departure = Departure.EMPTY
         self._costs = costs
         self._agents = first.agents
         self._max_agents = max_agents
         self._limit = costs.batch_agents(first.key, max_agents)
+        self._share = share
         self._deadline = first.deadline
         self._start = now + costs.after
 
@@ -309,7 +339,9 @@ class _Batch(Generic[AnyWork]):
             return False
         agents = self._agents + entry.agents
         deadline = min(self._deadline, entry.deadline)
-        if agents > self._limit:
+        if self._share is not None and agents > self._share:
+            self.departure = Departure.SHARE
+        elif agents > self._limit:
             self.departure = Departure.AGENTS if self._limit == self._max_agents else Departure.TIME
         elif self._start + self._costs.seconds(entry.key, agents) > deadline:
             self.departure = Departure.DEADLINE

@@ -208,7 +208,7 @@ class Shadow:
             for part in self._batcher.spare_parts(group.job):
                 await self._until_free(work)
                 parts.append(await self._batcher.run_spare(part))
-            outcome = combine(parts)
+            outcome = replace(combine(parts), queue=0.0)  # nothing waited for it
             self._metrics.inference.labels(name).observe(outcome.inference)
             outcomes.append(outcome)
         broken = await loop.run_in_executor(self._thread, set_outcomes, groups, outcomes)

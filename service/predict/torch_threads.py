@@ -25,6 +25,8 @@ _MAX_WORKERS = 4
 class ForwardThreads(NamedTuple):
     """Numbers of forwards that may run at the same time, and of their threads."""
 
+    total: int
+    """Threads of all forwards together."""
     forwards: int
     """Forwards at the same time."""
     width: int
@@ -33,7 +35,7 @@ class ForwardThreads(NamedTuple):
     """Processes that run them, as many as forwards; 0: threads of the server's process do."""
 
 
-ONE_FORWARD = ForwardThreads(1, 1, 0)
+ONE_FORWARD = ForwardThreads(1, 1, 1, 0)
 
 
 def forward_threads(threads: int | None = None, workers: int | None = None) -> ForwardThreads:
@@ -46,14 +48,16 @@ def forward_threads(threads: int | None = None, workers: int | None = None) -> F
         threads: threads of all forwards together; None: as many as the quota allows, at most one for each
             physical core. More threads than a CPU quota allows would use it up early in each period and then
             stand still together.
-        workers: number of processes; None: one for each thread, at most four, if there are two threads and
-            the system has what processes share.
+        workers: number of processes; None: two to four, so that no thread is left over, or few; none where
+            there is one thread, or where the system lacks what processes share.
     """
     total = _threads(threads)
     if workers is None:
-        workers = min(total, _MAX_WORKERS) if total > 1 and hasattr(os, "memfd_create") else 0
+        workers = 0
+        if total > 1 and hasattr(os, "memfd_create"):
+            workers = max(range(2, min(total, _MAX_WORKERS) + 1), key=lambda n: (total // n * n, n))
     forwards = workers or min(total, 2)
-    return ForwardThreads(forwards, max(1, total // forwards), workers)
+    return ForwardThreads(total, forwards, max(1, total // forwards), workers)
 
 
 def _threads(threads: int | None) -> int:

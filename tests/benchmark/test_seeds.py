@@ -9,7 +9,7 @@ import pytest
 
 from benchmark.compare import bootstrap_interval
 from benchmark.errors import BenchmarkError
-from benchmark.results import Instances
+from benchmark.results import BenchmarkResults, Instances
 from benchmark.seeds import compare_seeds, seed_interval, table
 from model.arrays import Floats, Ints
 from tests.benchmark.builders import made_metrics, made_model, made_results
@@ -55,8 +55,9 @@ def test_constants_by_hand() -> None:
     assert seed_interval(a, b, SCENES) == pytest.approx((-1.0, -1.0))
     b[1] = 10.0
     low, high = seed_interval(a, b, SCENES)
-    assert low == pytest.approx(-1.0)  # the third training is in none of the three drawn ones
-    assert high == pytest.approx(2.0)
+    wider = math.sqrt(3 / 2)  # of the three drawn trainings, none or all are the second one
+    assert low == pytest.approx(0.0 - wider)
+    assert high == pytest.approx(0.0 + 2 * wider)
 
 
 def test_pairs_that_a_training_lacks_do_not_count() -> None:
@@ -96,7 +97,20 @@ def test_runs_of_trainings_are_compared(tmp_path: Path) -> None:
 
 def test_a_run_of_other_pairs_is_refused(tmp_path: Path) -> None:
     runs = [saved(tmp_path / "0", {"cab": 8.0}), saved(tmp_path / "1", {"cab": 8.0}, plan="4567")]
-    with pytest.raises(BenchmarkError, match="other pairs"):
+    with pytest.raises(BenchmarkError, match="other plan"):
+        compare_seeds(runs, "cab", "cab")
+
+
+def test_a_run_that_is_given_twice_is_refused(tmp_path: Path) -> None:
+    run = saved(tmp_path / "0", {"cab": 8.0})
+    with pytest.raises(BenchmarkError, match="twice"):
+        compare_seeds([run, run], "cab", "cab")
+
+
+def test_runs_of_other_settings_are_refused(tmp_path: Path) -> None:
+    runs = [saved(tmp_path / str(number), {"cab": 8.0}) for number in range(2)]
+    replace(BenchmarkResults.read(runs[1]), samples=7).write(runs[1])
+    with pytest.raises(BenchmarkError, match="other samples"):
         compare_seeds(runs, "cab", "cab")
 
 

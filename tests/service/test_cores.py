@@ -64,15 +64,18 @@ def test_without_control_groups_all_cores_may_be_used(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("setting", "workers", "quota", "expected"),
     [
-        (None, None, 2.5, (2, 1, 2)),
-        (None, None, 0.5, (1, 1, 0)),
-        (None, None, 100.0, (4, 1, 4)),
-        (None, None, 8.0, (4, 1, 4)),
-        (8, None, 1.0, (4, 2, 4)),
-        (3, 0, 1.0, (2, 1, 0)),
-        (None, 0, 8.0, (2, 2, 0)),
-        (None, 3, 8.0, (3, 1, 3)),
-        (1, 2, 8.0, (2, 1, 2)),
+        (None, None, 2.5, (2, 2, 1, 2)),
+        (None, None, 0.5, (1, 1, 1, 0)),
+        (None, None, 100.0, (4, 4, 1, 4)),
+        (None, None, 8.0, (4, 4, 1, 4)),
+        (5, None, 1.0, (5, 4, 1, 4)),
+        (6, None, 1.0, (6, 3, 2, 3)),
+        (7, None, 1.0, (7, 3, 2, 3)),
+        (8, None, 1.0, (8, 4, 2, 4)),
+        (3, 0, 1.0, (3, 2, 1, 0)),
+        (None, 0, 8.0, (4, 2, 2, 0)),
+        (None, 3, 8.0, (4, 3, 1, 3)),
+        (1, 2, 8.0, (1, 2, 1, 2)),
     ],
 )
 def test_a_quota_bounds_the_threads_of_the_forward(
@@ -80,7 +83,7 @@ def test_a_quota_bounds_the_threads_of_the_forward(
     setting: int | None,
     workers: int | None,
     quota: float,
-    expected: tuple[int, int, int],
+    expected: tuple[int, int, int, int],
 ) -> None:
     cores = 8 if quota == 8.0 else 128
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))

@@ -13,6 +13,8 @@ from cab.forecast.v1 import prediction_service_pb2 as pb
 from cab_forecast import AsyncClient, scene_raster
 from model.registry import Registry
 from service.predict.catalog import Models
+from service.predict.plan import Plan
+from service.predict.publisher import Publisher
 from service.server import Server
 from tests.service.fakes import FakeForecaster, registry
 from tests.service.requests import NOW, add_agent, make_request
@@ -78,6 +80,21 @@ async def test_its_series_stand_beside_the_firsts_and_responses_hold_nothing_of_
             assert value(server, "forecast_agents_total", model=model, status="ok") == frames
         assert value(server, "forecast_inference_seconds_count", model=NAME) == frames
         assert calls(server) == {"done": frames, "dropped": 0, "failed": 0}
+
+
+async def test_a_forecast_of_the_shadow_has_waited_for_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    waited: list[float] = []
+
+    def record(publisher: Publisher, request: object, plan: Plan, instants: object) -> None:
+        waited.extend(group.outcome.queue for group in plan.groups if group.outcome is not None)
+
+    monkeypatch.setattr(Publisher, "shadowed", record)
+    async with running(*pair(), **shadowed()) as server:
+        request = make_request(2)
+        request.scene_id = "street"
+        await TRANSPORTS["grpc"](server, request)
+        await until(lambda: bool(waited))
+    assert waited == [0.0]
 
 
 async def test_under_load_no_answer_is_lost_or_mixed_and_the_shadow_gives_way(

@@ -355,7 +355,7 @@ async def test_a_crash_beside_another_forward_is_told_once(
     fake: FakeForecaster, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     crash = Mock()
-    batcher = Batcher(8, Admission(8, 20, Metrics()), Metrics(), ForwardThreads(2, 1, 0))
+    batcher = Batcher(8, Admission(8, 20, Metrics()), Metrics(), ForwardThreads(2, 2, 1, 0))
     batcher._costs.measure(None, 8, 1e-6)
     batcher.start(crash)
     other = FakeForecaster()
@@ -440,12 +440,14 @@ async def test_threads_of_the_forward() -> None:
             seen.append((torch.get_num_threads(), torch.is_inference_mode_enabled()))
             return super().forecast(*arguments, **named)
 
-    batcher = Batcher(8, Admission(8, 20, Metrics()), Metrics(), ForwardThreads(1, 3, 0))
+    before = torch.get_num_threads()
+    batcher = Batcher(8, Admission(8, 20, Metrics()), Metrics(), ForwardThreads(3, 1, 3, 0))
     batcher.start()
     try:
         await submit(batcher, job(Counting(), 1))
     finally:
         await batcher.stop()
+        torch.set_num_threads(before)  # what a thread sets is the default of those that start later
     assert seen == [(3, True)]
 
 
@@ -467,7 +469,7 @@ async def begun(fake: FakeForecaster, forwards: int) -> None:
 @pytest.fixture
 async def pair(admission: Admission) -> AsyncIterator[Batcher]:
     """A batcher with two forwards at a time, and forwards that are too short to spread a call over both."""
-    made = Batcher(8, admission, Metrics(), ForwardThreads(2, 1, 0))
+    made = Batcher(8, admission, Metrics(), ForwardThreads(2, 2, 1, 0))
     made._costs.measure(None, 8, 1e-6)
     made.start()
     yield made
@@ -497,6 +499,26 @@ async def test_the_free_forwards_share_a_call_that_is_alone(pair: Batcher, fake:
     assert sorted(agents for _, agents, _, _ in fake.batches) == [3, 4]
     assert outcome.mixture.origin[:, 0].tolist() == [10, 11, 12, 13, 14, 15, 16]
     assert outcome.batch_agents == 4
+
+
+async def test_a_call_whose_parts_would_be_late_is_not_spread(pair: Batcher, fake: FakeForecaster) -> None:
+    fake.free.set()
+    pair._costs.measure(job(fake, 1).key, 8, 100.0)  # a wrong estimate
+    admitted = Call(asyncio.get_running_loop().time() + 10.0)
+    [outcome] = await pair.run([job(fake, 8)], admitted)
+    assert outcome.batch_agents == 8
+    assert len(fake.batches) == 1
+
+
+async def test_a_call_fails_with_the_first_part_that_fails(pair: Batcher, fake: FakeForecaster) -> None:
+    pair._costs.measure(job(fake, 1).key, 8, 0.1)
+    call = submit(pair, job(fake, 8))
+    await begun(fake, 2)
+    with capture_logs():
+        pair._fail(pair._batches[1].entries, Internal())
+        with pytest.raises(Internal):
+            await call  # although the first part is still in the model
+    fake.free.set()
 
 
 async def test_a_busy_server_does_not_spread_calls(pair: Batcher, fake: FakeForecaster) -> None:
@@ -590,7 +612,7 @@ async def test_few_agents_wait_for_a_forward_that_ends_before_theirs_would(
 async def test_the_event_loop_rests_while_few_agents_wait(
     fake: FakeForecaster, monkeypatch: pytest.MonkeyPatch, forwards: int
 ) -> None:
-    batcher = Batcher(32, Admission(32, 64, Metrics()), Metrics(), ForwardThreads(forwards, 1, 0))
+    batcher = Batcher(32, Admission(32, 64, Metrics()), Metrics(), ForwardThreads(forwards, forwards, 1, 0))
     batcher.start()
     first = await hold(batcher, fake)
     second = submit(batcher, job(fake, 1))

@@ -79,7 +79,8 @@ def test_timing_is_of_all_batches_and_counts_what_runs_at_the_same_time_once() -
     first.outcome = replace(first.outcome, queue=0.3, inference=0.25, batch_agents=5)
     second.outcome = replace(second.outcome, queue=0.2, inference=0.25, batch_agents=2)
     timing = encode(plan_of([first, second]), seed=0).timing
-    assert (timing.queue, timing.inference, timing.batch_agents) == (0.2, pytest.approx(0.35), 5)
+    assert (timing.queue, timing.batch_agents) == (0.2, 5)
+    assert timing.inference == pytest.approx(0.35)
 
 
 def test_an_invalid_agent_has_its_fault_and_no_numbers() -> None:

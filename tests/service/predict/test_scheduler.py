@@ -184,7 +184,7 @@ def test_each_size_has_its_own_rate_and_others_that_of_the_nearest() -> None:
     assert model.batch_agents("new", 1000) == 160
 
 
-def test_a_size_that_does_not_occur_becomes_slower_as_the_others_do() -> None:
+def test_a_size_that_does_not_occur_becomes_slower_and_faster_as_the_others_do() -> None:
     model = CostModel()
     model.measure("model", 8, 8 / 1000)
     model.measure("model", 128, 128 / 2000)
@@ -200,6 +200,43 @@ def test_a_size_that_does_not_occur_becomes_slower_as_the_others_do() -> None:
         model.measure("model", 8, 8 / 1000)
     assert model.seconds("model", 128) == pytest.approx(128 / 2000, rel=0.1)
     assert model.seconds("model", 8) == pytest.approx(8 / 1000, rel=0.01)
+
+
+def test_a_size_that_does_not_occur_does_not_become_faster_than_it_was() -> None:
+    model = CostModel()
+    model.measure("model", 1, 0.003)  # cold
+    model.measure("model", 128, 128 / 2000)
+    for _ in range(60):
+        model.measure("model", 1, 0.001)
+    assert model.seconds("model", 128) == pytest.approx(128 / 2000, rel=0.1)
+
+
+def test_one_stall_makes_no_size_slow_for_long() -> None:
+    model = CostModel()
+    for size in (8, 128):
+        model.measure("model", size, size / 1000)
+    for _ in range(30):
+        model.measure("model", 8, 8 / 1000)
+    model.measure("model", 8, 0.5)
+    assert model.seconds("model", 128) < 1.3 * 128 / 1000
+
+
+def test_forwards_share_a_call_that_is_alone() -> None:
+    model = CostModel()
+    model.measure("model", 128, 0.1)
+    assert model.alone(128) == pytest.approx(0.1)
+    model.forwards = 4
+    model.measure("model", 32, 0.028)
+    assert model.alone(128) == pytest.approx(0.028)
+    assert model.work(128) == pytest.approx(0.1)
+    assert [model.share("model", 32, free) for free in (0, 1, 2, 4, 8)] == [32, 32, 16, 8, 8]
+    assert model.share("model", 4, 4) == 4  # 3.5 ms of work
+
+
+def test_what_other_forwards_share_is_no_limit() -> None:
+    several = [Entry(9.0, 4) for _ in range(4)]
+    batch, _, departure = queue(*several).take_batch(0.0, 1000, share=8)
+    assert (len(batch), departure) == (2, Departure.SHARE)
 
 
 def test_a_size_that_is_new_under_load_has_the_rate_that_was_measured() -> None:

@@ -790,7 +790,7 @@ class Timing(_message.Message):
     queue: _builtins.float
     """s from acceptance to the start of the (first) batch: decoding, and waiting for the model to be free."""
     inference: _builtins.float
-    """s inside the model, of all batches that this call rode in."""
+    """s inside the model, of all batches that this call rode in; those that ran at the same time count once."""
     batch_agents: _builtins.int
     """Agents in the (largest) batch that it rode in, other calls' included."""
     tracking: _builtins.float
