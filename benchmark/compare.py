@@ -296,14 +296,23 @@ def bootstrap_interval(values: Floats, scenes: Ints, divisors: Floats | None = N
     if count < 2:
         return math.nan, math.nan
     sums, sizes = np.bincount(members, values), np.bincount(members, divisors)
-    generator = np.random.default_rng(SEED)
-    drawn = generator.multinomial(count, np.full(count, 1 / count), size=RESAMPLES)
+    drawn = resamples(np.random.default_rng(SEED), count)
     totals = drawn @ sizes
     kept = totals > 0
     if not kept.any():
         return math.nan, math.nan
-    means = (drawn @ sums)[kept] / totals[kept]
-    low, high = np.quantile(means, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    return percentile_interval((drawn @ sums)[kept] / totals[kept])
+
+
+def resamples(generator: np.random.Generator, count: int) -> Ints:
+    """Return how often each of some things is in each resample of as many: [RESAMPLES, count]."""
+    drawn: Ints = generator.multinomial(count, np.full(count, 1 / count), size=RESAMPLES)
+    return drawn
+
+
+def percentile_interval(figures: Floats) -> tuple[float, float]:
+    """Return the bounds between which a figure of the resamples lies with probability ``LEVEL``."""
+    low, high = np.quantile(figures, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     return float(low), float(high)
 
 

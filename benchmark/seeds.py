@@ -15,7 +15,15 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmark.compare import KEY_FIGURES, LEVEL, RESAMPLES, SEED, bounds
+from benchmark.compare import (
+    KEY_FIGURES,
+    LEVEL,
+    RESAMPLES,
+    SEED,
+    bounds,
+    percentile_interval,
+    resamples,
+)
 from benchmark.errors import BenchmarkError
 from benchmark.results import PER_INSTANCE, BenchmarkModelResult, BenchmarkResults, Instances
 from model.arrays import Floats, Ints
@@ -101,19 +109,18 @@ def seed_interval(a: Floats, b: Floats, scenes: Ints) -> tuple[float, float]:
     if count < 2:
         return math.nan, math.nan
     generator = np.random.default_rng(SEED)
-    drawn = generator.multinomial(count, np.full(count, 1 / count), size=RESAMPLES)
+    drawn = resamples(generator, count)
     pairs = drawn @ np.bincount(members)
     means = []
     for values in (a[:, known], b[:, known]):
         sums = np.stack([np.bincount(members, one, minlength=count) for one in values])  # [S, scenes]
         trainings = len(values)
         each = (drawn @ sums.T) / pairs[:, None]  # [RESAMPLES, S]
-        weights = generator.multinomial(trainings, np.full(trainings, 1 / trainings), size=RESAMPLES)
+        weights = resamples(generator, trainings)
         center = each.mean(axis=1)
         deviation = (each * weights).sum(axis=1) / trainings - center
         means.append(center + deviation * math.sqrt(trainings / max(trainings - 1, 1)))
-    low, high = np.quantile(means[1] - means[0], [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
-    return float(low), float(high)
+    return percentile_interval(means[1] - means[0])
 
 
 def table(figures: Sequence[SeedFigure], a: str, b: str) -> Table:

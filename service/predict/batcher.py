@@ -470,8 +470,7 @@ class Batcher:
             start: time on the event loop's clock when its forward can start.
             share: number of agents after which the rest is for other forwards.
         """
-        others = share if share < self._queue.agents else None
-        batch, late, departure = self._queue.take_batch(start, self._max_batch, others)
+        batch, late, departure = self._queue.take_batch(start, self._max_batch, share)
         for entry in late:
             self._metrics.refused.labels("dropped").inc()
             entry.done.set_exception(DeadlineExceeded())

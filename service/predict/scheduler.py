@@ -148,7 +148,8 @@ class CostModel:
 
     def seconds(self, key: Hashable, agents: int) -> float:
         """Return the expected seconds of a forward of so many agents."""
-        return agents / self._rate(key, agents)
+        known = self._known(key)
+        return agents / (known.of(agents) if known else _FIRST_RATE)
 
     def seconds_of_unknown(self, agents: int) -> float:
         """Return the expected seconds of a forward by a model that is not known yet."""
@@ -226,11 +227,6 @@ class CostModel:
     def work(self, agents: int) -> float:
         """Return the expected seconds of all work for a call, by a model that is not known yet."""
         return self.seconds_of_unknown(agents) + self.around(agents)
-
-    def _rate(self, key: Hashable, agents: int) -> float:
-        """Return the rate of the known size that is nearest, the larger one of two."""
-        known = self._known(key)
-        return known.of(agents) if known else _FIRST_RATE
 
     def _known(self, key: Hashable) -> _Rates | None:
         """Return the rates of a key, those of another one if nothing is known of it."""

@@ -16,8 +16,6 @@ from service.cores import usable_cores, whole_cores
 
 _CORES = torch.get_num_threads()
 """torch's choice when the process starts: the physical cores."""
-
-
 _MAX_WORKERS = 4
 """Number of workers by default, at most: each takes some 330 MiB."""
 
