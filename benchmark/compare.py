@@ -1,25 +1,26 @@
 """Comparison of two runs, with the uncertainty of the differences.
 
 If both runs hold figures of the same pairs, a difference is the mean over the pairs that both have. Its 95 %
-interval is a percentile bootstrap over scenes (``RESAMPLES`` resamples, seed ``SEED``): pairs of one scene
-are alike, so whole scenes are resampled.
+interval is by bootstrap over scenes (``benchmark.bootstrap``).
 """
 
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 
-from benchmark.results import PER_INSTANCE, BenchmarkModelResult, BenchmarkResults, Instances
+from benchmark.bootstrap import LEVEL, RESAMPLES, SEED, difference_interval, mean_interval
+from benchmark.results import COMPLIANCE, FDE, HARDEST, BenchmarkModelResult, BenchmarkResults, Instances
 from model.arrays import Floats, Ints
 from model.evaluation.tables import UNKNOWN, Table, document, number, signed
+from model.metrics.consistency import RANGES_M
 
 KEY_FIGURES = {
     "ADE-ML 6 s": "ade_ml_6s_m",
-    "FDE-ML 6 s": "fde_ml_6s_m",
+    "FDE-ML 6 s": FDE,
+    "merged FDE 6 s": "fde_merged_6s_m",
     "OffR-ML": "off_road_ml",
     "FDE-f 6 s": "fde_f_6s_m",
     "minADE_5": "min_ade_5_m",
@@ -28,17 +29,16 @@ KEY_FIGURES = {
     "merged brier-minFDE_5": "merged_brier_min_fde_5_m",
     "NLL": "nll",
     "D, std": "dispersion_std_m",
-    "C(1 m)": "convergence_1m_s",
-    "FDE, hardest 3 %": "fde_hardest_3_m",
+    **{f"C({range_m:g} m)": f"convergence_{range_m:g}m_s" for range_m in RANGES_M},
+    **{f"FDE, hardest {100 * share:g} %": name for name, share in HARDEST.items()},
+    "Gain by context": "gain_m",
+    "advantage of the right map": "map_advantage_m",
+    "advantage of the right neighbours": "neighbors_advantage_m",
+    "compliance": COMPLIANCE,
 }
+"""Metrics and measures of the context (over all pairs), by their names in tables."""
 CLEAR = 2.0
 """Standard errors that a clear difference exceeds."""
-RESAMPLES: Final = 2000
-"""Bootstrap resamples of the scenes."""
-SEED: Final = 0
-"""Seed of the bootstrap."""
-LEVEL: Final = 0.95
-"""Probability that an interval is to hold."""
 
 _SETTINGS = (
     "protocol",
@@ -66,7 +66,8 @@ class Difference:
     difference: float
     """B − A; in a paired comparison, its mean over the pairs that both runs have."""
     standard_error: float
-    """Standard error of that mean as if pairs were independent; NaN without a paired comparison."""
+    """Standard error of that mean as if pairs were independent; NaN without a paired comparison, and for
+    figures that are not means over all pairs."""
     pairs: int
     """Number of compared pairs; 0: no paired comparison."""
     interval: tuple[float, float] = (math.nan, math.nan)
@@ -75,12 +76,13 @@ class Difference:
 
     @property
     def clear(self) -> bool | None:
-        """True if the difference exceeds two standard errors and its interval, if known, excludes 0; None:
-        unknown."""
-        if math.isnan(self.standard_error) or math.isnan(self.difference):
-            return None
+        """True if the difference exceeds two standard errors and its interval excludes 0, as far as these are
+        known; None: unknown."""
         low, high = self.interval
-        return abs(self.difference) > CLEAR * self.standard_error and not low <= 0 <= high
+        if math.isnan(self.difference) or (math.isnan(self.standard_error) and math.isnan(low)):
+            return None
+        small = abs(self.difference) <= CLEAR * self.standard_error
+        return not small and not low <= 0 <= high
 
 
 @dataclass(frozen=True)
@@ -242,15 +244,18 @@ def _differences(
     scenes = b.scenes if a.scenes is None else a.scenes  # the plans are equal, and so are the scenes
     found = []
     for figure, name in KEY_FIGURES.items():
-        was, now = (model.metrics.get(name, math.nan) for model in (one, other))
+        was, now = one.figure(name), other.figure(name)
         if math.isnan(was) and math.isnan(now):
             continue
-        keys = f"{one.key}/{name}", f"{other.key}/{name}"
-        if name in PER_INSTANCE and keys[0] in a.figures and keys[1] in b.figures:
-            pairs = (a.figures[keys[0]], b.figures[keys[1]])
-            found.append(_paired_difference(figure, was, now, *pairs, scenes))
-        else:
-            found.append(Difference(figure, was, now, now - was, math.nan, 0))
+        pairs = a.figures.get(f"{one.key}/{name}"), b.figures.get(f"{other.key}/{name}")
+        if pairs[0] is not None and pairs[1] is not None:
+            found.append(_paired_difference(figure, was, now, pairs[0], pairs[1], scenes))
+            continue
+        ratios = a.ratio(one.key, name), b.ratio(other.key, name)
+        interval = (math.nan, math.nan)
+        if ratios[0] is not None and ratios[1] is not None:
+            interval = difference_interval([ratios[0]], [ratios[1]])
+        found.append(Difference(figure, was, now, now - was, math.nan, 0, interval))
     return tuple(found)
 
 
@@ -272,48 +277,8 @@ def _paired_difference(
     count = len(differences)
     mean = float(differences.mean()) if count else math.nan
     error = float(differences.std(ddof=1)) / math.sqrt(count) if count > 1 else math.nan
-    interval = (math.nan, math.nan) if scenes is None else bootstrap_interval(differences, scenes[both])
+    interval = (math.nan, math.nan) if scenes is None else mean_interval(differences, scenes[both])
     return Difference(figure, was, now, mean, error, count, interval)
-
-
-def bootstrap_interval(values: Floats, scenes: Ints, divisors: Floats | None = None) -> tuple[float, float]:
-    """Return the 95 % interval of a mean or a ratio by bootstrap over scenes (Efron's percentile interval).
-
-    Each of ``RESAMPLES`` resamples draws as many scenes as there are, with replacement, and takes the mean
-    over all their values. Equal scenes give equal resamples, whatever the values.
-
-    Args:
-        values: [N], finite.
-        scenes: [N], index of each value's scene.
-        divisors: [N], ≥ 0: the figure is the sum of the values over that of the divisors; resamples whose
-            divisors are all 0 are left out. None: the mean of the values.
-
-    Returns:
-        Lower and upper bound; NaN for fewer than two scenes, or if all divisors are 0.
-    """
-    distinct, members = np.unique(scenes, return_inverse=True)
-    count = len(distinct)
-    if count < 2:
-        return math.nan, math.nan
-    sums, sizes = np.bincount(members, values), np.bincount(members, divisors)
-    drawn = resamples(np.random.default_rng(SEED), count)
-    totals = drawn @ sizes
-    kept = totals > 0
-    if not kept.any():
-        return math.nan, math.nan
-    return percentile_interval((drawn @ sums)[kept] / totals[kept])
-
-
-def resamples(generator: np.random.Generator, count: int) -> Ints:
-    """Return how often each of some things is in each resample of as many: [RESAMPLES, count]."""
-    drawn: Ints = generator.multinomial(count, np.full(count, 1 / count), size=RESAMPLES)
-    return drawn
-
-
-def percentile_interval(figures: Floats) -> tuple[float, float]:
-    """Return the bounds between which a figure of the resamples lies with probability ``LEVEL``."""
-    low, high = np.quantile(figures, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
-    return float(low), float(high)
 
 
 def _row(model: ComparedModel, one: Difference) -> tuple[str, ...]:

@@ -15,9 +15,9 @@ from benchmark.answers import CallTimes, SceneAnswers, read_answers
 from benchmark.archive import Archive
 from benchmark.errors import BenchmarkError
 from benchmark.hard_cases import hardest_fde
-from benchmark.models import KALMAN, is_learned, oldest_first, protocol_of
+from benchmark.models import is_learned, oldest_first, protocol_of
 from benchmark.plan import PlannedScene
-from benchmark.results import PER_INSTANCE, BenchmarkModelResult, Instances, Latency
+from benchmark.results import FDE, PER_INSTANCE, BenchmarkModelResult, Instances, Latency
 from cab.forecast.v1.model_service_pb2 import Model
 from model.arrays import Floats, Ints
 from model.data.checks import STEPS_AHEAD
@@ -41,7 +41,6 @@ CONSISTENCY = (
     *(f"convergence_{range_m:g}m_s" for range_m in RANGES_M),
 )
 """Metrics of table 2: the paper's D in its three forms, C(τ) in seconds."""
-_FDE = "fde_ml_6s_m"
 
 
 @dataclass(frozen=True)
@@ -99,19 +98,21 @@ def evaluate(
         BenchmarkError: an answer does not fit its call, or a process died.
     """
     pairs = sum(len(scene.pairs) for scene in scenes)
-    totals: dict[str, _Totals] = {key: _Totals(pairs) for key in models}
+    totals: dict[str, _Totals] = {key: _Totals(pairs, len(scenes)) for key in models}
     work = _Work(folder, tuple(models), sampling, consistency)
-    for scene, found in _evaluated_scenes(scenes, work, processes):
+    for number, found in _evaluated_scenes(scenes, work, processes):
         for key, metrics in found.items():
-            totals.setdefault(key, _Totals(pairs)).add(metrics)
-        tick(len(scene.pairs))
-    ranking = [key for key in oldest_first(models) if key.partition("@")[0] == KALMAN]
-    kalman = [totals[key].each[_FDE] for key in ranking if _FDE in totals[key].each]
-    mismatch_m = kalman[-1] if kalman else None
+            totals.setdefault(key, _Totals(pairs, len(scenes))).add(number, metrics)
+        tick(len(scenes[number].pairs))
     each = {f"{key}/{name}": values for key, total in totals.items() for name, values in total.each.items()}
+    of_scenes = {
+        f"{key}/{name}": sums for key, total in totals.items() for name, sums in total.of_scenes.items()
+    }
     numbers = np.repeat(np.arange(len(scenes)), [len(scene.pairs) for scene in scenes])
+    instances = Instances(each, numbers, of_scenes)
+    mismatch_m = instances.mismatch_m()
     results = tuple(total.result(models.get(key), mismatch_m) for key, total in totals.items())
-    return Evaluated(results, Instances(each, numbers), mismatch_m)
+    return Evaluated(results, instances, mismatch_m)
 
 
 def evaluate_scene(
@@ -188,17 +189,18 @@ class _Work:
 
 def _evaluated_scenes(
     scenes: Sequence[PlannedScene], work: _Work, processes: int
-) -> Iterator[tuple[PlannedScene, dict[str, SceneMetrics]]]:
+) -> Iterator[tuple[int, dict[str, SceneMetrics]]]:
+    """Yield the index of each scene, and its metrics by model."""
     if processes == 1:
-        for scene in scenes:
-            yield scene, work(scene)
+        for number, scene in enumerate(scenes):
+            yield number, work(scene)
         return
     # Spawned: a fork would copy threads of torch and gRPC in an arbitrary state
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(processes, len(scenes)), mp_context=context) as pool:
         # The longest scenes first, so that no process is left with one at the end
-        ordered = sorted(scenes, key=lambda scene: -scene.forecasts)
-        futures = {pool.submit(work, scene): scene for scene in ordered}
+        ordered = sorted(range(len(scenes)), key=lambda number: -scenes[number].forecasts)
+        futures = {pool.submit(work, scenes[number]): number for number in ordered}
         try:
             for done in as_completed(futures):
                 yield futures[done], done.result()
@@ -261,14 +263,17 @@ class _Totals:
     """Metrics of one model over the scenes so far."""
 
     pairs: int
+    scenes: int
     means: MetricMeans = field(default_factory=MetricMeans)
     instants: MetricMeans = field(default_factory=MetricMeans)
     statuses: Counter[str] = field(default_factory=Counter)
     lost: int = 0
     times: list[CallTimes] = field(default_factory=list)
     each: dict[str, Floats] = field(default_factory=dict)
+    of_scenes: dict[str, Floats] = field(default_factory=dict)
 
-    def add(self, scene: SceneMetrics) -> None:
+    def add(self, number: int, scene: SceneMetrics) -> None:
+        """Add the metrics of a scene, by its index."""
         self.means.add(scene.metrics)
         self.instants.add(scene.instants)
         self.statuses.update(scene.statuses)
@@ -279,6 +284,10 @@ class _Totals:
             if name in scene.metrics:
                 values = self.each.setdefault(name, np.full(self.pairs, np.nan))
                 values[scene.instances] = scene.metrics[name]
+        for name, values in scene.instants.items():
+            sums = self.of_scenes.setdefault(name, np.zeros((self.scenes, 2)))
+            known = np.isfinite(values)
+            sums[number] = values[known].sum(), known.sum()
 
     def result(self, model: Model | None, mismatch_m: Floats | None) -> BenchmarkModelResult:
         """Return the result of a model.
@@ -289,8 +298,8 @@ class _Totals:
                 not evaluated.
         """
         metrics = self.means.figures() | self.instants.means()
-        if mismatch_m is not None and _FDE in self.each:
-            metrics |= hardest_fde(self.each[_FDE], mismatch_m)
+        if mismatch_m is not None and FDE in self.each:
+            metrics |= hardest_fde(self.each[FDE], mismatch_m)
         described = Model(name=ORACLE) if model is None else model
         learned = model is not None and is_learned(model)
         return BenchmarkModelResult(

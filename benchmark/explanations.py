@@ -15,7 +15,7 @@ from typing import Final, TypeAlias
 import numpy as np
 from google.protobuf import json_format
 
-from benchmark.compare import bootstrap_interval
+from benchmark.bootstrap import mean_interval
 from benchmark.errors import BenchmarkError
 from benchmark.plan import Call, PlannedScene
 from benchmark.requests import SceneRequests
@@ -196,6 +196,6 @@ def _means(values: Floats, scenes: Ints) -> dict[str, Estimate]:
     if not len(values):
         return {}
     return {
-        part: Estimate(float(column.mean()), *bootstrap_interval(column, scenes), len(column))
+        part: Estimate(float(column.mean()), *mean_interval(column, scenes), len(column))
         for part, column in zip(PARTS, values.T, strict=True)
     }

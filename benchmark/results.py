@@ -11,16 +11,20 @@ from zipfile import BadZipFile
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
+from benchmark.bootstrap import Ratio
 from benchmark.errors import BenchmarkError
+from benchmark.models import KALMAN, oldest_first
 from model.arrays import Floats, Ints
 from model.evaluation.results import RESULTS_FILE, ModelResult, Results, replacing
 from model.forecaster import Protocol
+from model.metrics.hard import HARD_SHARES, hardest
 
 INSTANCES_FILE: Final = "instances.npz"
 """Figures of each pair, for paired comparisons of two runs."""
 PER_INSTANCE: Final = (
     "ade_ml_6s_m",
     "fde_ml_6s_m",
+    "fde_merged_6s_m",
     "min_ade_5_m",
     "min_ade_10_m",
     "merged_min_ade_5_m",
@@ -31,8 +35,18 @@ PER_INSTANCE: Final = (
     "fde_f_6s_m",
 )
 """Figures in ``instances.npz``, as ``<name@version>/<figure>`` [pairs], NaN where missing."""
+FDE: Final = "fde_ml_6s_m"
+HARDEST: Final = {f"fde_hardest_{round(100 * share)}_m": share for share in HARD_SHARES}
+"""Shares of the pairs by the name of the mean FDE over them."""
+ALL: Final = "all"
+"""The subset of all pairs among the measures of the context."""
+COMPLIANCE: Final = "compliance"
+OFF_ROAD, NO_CONTEXT_OFF_ROAD = "donor_map_off_road", "donor_map_off_road_no_context"
+"""Figures of each pair that compliance is computed of: ``context.measures.ContextFigures``."""
 _SCENES: Final = "scenes"
 """Entry of ``instances.npz``: [pairs], the index of each pair's scene."""
+_OF_SCENES: Final = "of scenes/"
+"""Beginning of the names of entries of ``instances.npz`` with a row for each scene."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +135,11 @@ class BenchmarkModelResult(ModelResult):
         lost = self.lost + self.context_missing
         return self.statuses.get("MISSING", 0) + self.statuses.get("INVALID", 0) + lost
 
+    def figure(self, name: str) -> float:
+        """Return a metric, or a measure of the context over all pairs; NaN where it is unknown."""
+        measured = self.context.get(ALL, {}).get(name)
+        return self.metrics.get(name, math.nan) if measured is None else measured.value
+
     @property
     def fallbacks(self) -> int:
         """Number of pairs that another model forecast."""
@@ -189,6 +208,34 @@ class Instances:
     """[pairs] by ``<name@version>/<figure>``, NaN where missing; see ``PER_INSTANCE``."""
     scenes: Ints | None = None
     """[pairs], index of each pair's scene; None in files of older versions."""
+    of_scenes: Mapping[str, Floats] = field(default_factory=dict)
+    """[scenes, 2] by ``<name@version>/<figure>``, for means over instants (``evaluate.CONSISTENCY``): the
+    figure's sum over the scene's instants, and their number."""
+
+    def ratio(self, model: str, figure: str) -> Ratio | None:
+        """Return a figure as a ratio of sums over the scenes; None: the run does not hold it so.
+
+        Args:
+            model: ``name@version``.
+            figure: name of a metric or of a measure of the context.
+        """
+        if (sums := self.of_scenes.get(f"{model}/{figure}")) is not None:
+            return Ratio(sums[:, 0], sums[:, 1], np.arange(len(sums)))
+        if self.scenes is None:
+            return None
+        if figure == COMPLIANCE:
+            return self._compliance(model, self.scenes)
+        if figure in HARDEST:
+            return self._hardest(model, HARDEST[figure], self.scenes)
+        values = self.figures.get(f"{model}/{figure}")
+        return None if values is None else Ratio(values, np.ones(len(values)), self.scenes)
+
+    def mismatch_m(self) -> Floats | None:
+        """Return the FDE at 6 s of the newest Kalman filter, which ranks the hard cases: [pairs], m; None: it
+        was not evaluated."""
+        models = {name.partition("/")[0] for name in self.figures if name.endswith(f"/{FDE}")}
+        kalman = [model for model in oldest_first(models) if model.partition("@")[0] == KALMAN]
+        return self.figures[f"{kalman[-1]}/{FDE}"] if kalman else None
 
     def write(self, folder: Path) -> None:
         """Write ``instances.npz``.
@@ -197,6 +244,7 @@ class Instances:
             OSError: the file cannot be written.
         """
         arrays: dict[str, Any] = dict(self.figures)
+        arrays |= {f"{_OF_SCENES}{name}": sums for name, sums in self.of_scenes.items()}
         if self.scenes is not None:
             arrays[_SCENES] = self.scenes
         with replacing(folder / INSTANCES_FILE) as temporary, temporary.open("wb") as file:
@@ -221,11 +269,30 @@ class Instances:
                 found = {name: arrays[name] for name in arrays.files}
         except (OSError, ValueError, BadZipFile) as error:
             raise BenchmarkError(f"{file}: cannot be read: {error}") from error
+        of_scenes = {
+            name.removeprefix(_OF_SCENES): found.pop(name)
+            for name in list(found)
+            if name.startswith(_OF_SCENES)
+        }
         for name, values in found.items():
             if values.shape != (pairs,):
                 raise BenchmarkError(f"{file}: {name} is of {list(values.shape)}, not of {pairs} pairs")
         scenes = found.pop(_SCENES, None)
-        return cls(found, scenes)
+        return cls(found, scenes, of_scenes)
+
+    def _compliance(self, model: str, scenes: Ints) -> Ratio | None:
+        off, reference = (self.figures.get(f"{model}/{name}") for name in (OFF_ROAD, NO_CONTEXT_OFF_ROAD))
+        if off is None or reference is None:
+            return None
+        return Ratio(reference - off, reference, scenes)
+
+    def _hardest(self, model: str, share: float, scenes: Ints) -> Ratio | None:
+        fde_m, mismatch_m = self.figures.get(f"{model}/{FDE}"), self.mismatch_m()
+        if fde_m is None or mismatch_m is None or not np.isfinite(mismatch_m).any():
+            return None
+        members = np.isfinite(mismatch_m)
+        members[members] = hardest(mismatch_m[members], share)
+        return Ratio(np.where(members, fde_m, 0.0), members.astype(np.float64), scenes)
 
 
 def _with_nan(document: Any) -> Any:

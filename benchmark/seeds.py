@@ -1,11 +1,8 @@
 """Comparison of two methods over trainings with several seeds.
 
-Each training is judged by a run of its own on the same pairs. The 95 % intervals are percentile bootstraps
-over seeds and scenes at once: each of ``RESAMPLES`` resamples draws as many trainings of each method and as
-many scenes as there are. So they hold what a single training does not show: that another seed would have
-come to another figure. Deviations of S drawn trainings from their mean are widened by √(S / (S − 1)), since
-resamples of few vary too little (Efron and Tibshirani 1993, chapter 5); with three trainings the interval
-still is a little narrow.
+Each training is judged by a run of its own on the same pairs. The 95 % intervals are by bootstrap over
+trainings and scenes at once (``benchmark.bootstrap``). So they hold what a single training does not show:
+that another seed would have come to another figure.
 """
 
 import math
@@ -15,18 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmark.compare import (
-    KEY_FIGURES,
-    LEVEL,
-    RESAMPLES,
-    SEED,
-    bounds,
-    percentile_interval,
-    resamples,
-)
+from benchmark.bootstrap import LEVEL, RESAMPLES, SEED, difference_interval
+from benchmark.compare import KEY_FIGURES, bounds
 from benchmark.errors import BenchmarkError
-from benchmark.results import PER_INSTANCE, BenchmarkModelResult, BenchmarkResults, Instances
-from model.arrays import Floats, Ints
+from benchmark.results import BenchmarkModelResult, BenchmarkResults, Instances
 from model.evaluation.tables import UNKNOWN, Table, number, signed
 
 _SETTINGS = ("pairs", "plan", "protocol", "samples", "draws")
@@ -42,7 +31,7 @@ class SeedFigure:
     """Figure of each training of A."""
     b: tuple[float, ...]
     interval: tuple[float, float]
-    """95 % interval of the difference of the means, B − A; NaN where there are no figures of each pair."""
+    """95 % interval of the difference of the means, B − A; NaN where a run does not hold what it takes."""
 
     @property
     def difference(self) -> float:
@@ -71,56 +60,28 @@ def compare_seeds(runs: Sequence[Path], a: str, b: str) -> list[SeedFigure]:
         for name in _SETTINGS:
             if getattr(one, name) != getattr(results[0], name):
                 raise BenchmarkError(f"{run}: is of other {name} than {runs[0]}")
+    contexts = {(one.context.no_context, one.context.donors) for one in results if one.context is not None}
+    if len(contexts) > 1:
+        raise BenchmarkError(
+            "the runs measured the context with other models without context, or other donors"
+        )
     instances = [Instances.read(run, one.pairs) for run, one in zip(runs, results, strict=True)]
-    scenes = next((one.scenes for one in instances if one.scenes is not None), None)
     trainings = [_trainings(name, results, instances) for name in (a, b)]
     for name, found in zip((a, b), trainings, strict=True):
         if not found:
             raise BenchmarkError(f"no run has {name}")
     figures = []
     for figure, metric in KEY_FIGURES.items():
-        values = [tuple(model.metrics.get(metric, math.nan) for model, _ in one) for one in trainings]
+        values = [tuple(model.figure(metric) for model, _ in one) for one in trainings]
         if not np.isfinite(np.concatenate(values)).all():
             continue
         interval = (math.nan, math.nan)
-        each = [[own.figures.get(f"{model.key}/{metric}") for model, own in one] for one in trainings]
-        known = [[values for values in one if values is not None] for one in each]
-        if scenes is not None and metric in PER_INSTANCE and list(map(len, known)) == list(map(len, each)):
-            interval = seed_interval(np.stack(known[0]), np.stack(known[1]), scenes)
+        each = [[own.ratio(model.key, metric) for model, own in one] for one in trainings]
+        known = [[ratio for ratio in one if ratio is not None] for one in each]
+        if list(map(len, known)) == list(map(len, each)):
+            interval = difference_interval(*known)
         figures.append(SeedFigure(figure, values[0], values[1], interval))
     return figures
-
-
-def seed_interval(a: Floats, b: Floats, scenes: Ints) -> tuple[float, float]:
-    """Return the 95 % interval of the mean of B − that of A over trainings and pairs.
-
-    Args:
-        a: [S, N], a figure of N pairs by S trainings; NaN where missing.
-        b: [R, N], likewise.
-        scenes: [N], index of each pair's scene.
-
-    Returns:
-        Lower and upper bound; NaN for fewer than two scenes. With a single training of each method it is the
-        interval over scenes.
-    """
-    known = np.isfinite(a).all(axis=0) & np.isfinite(b).all(axis=0)
-    distinct, members = np.unique(scenes[known], return_inverse=True)
-    count = len(distinct)
-    if count < 2:
-        return math.nan, math.nan
-    generator = np.random.default_rng(SEED)
-    drawn = resamples(generator, count)
-    pairs = drawn @ np.bincount(members)
-    means = []
-    for values in (a[:, known], b[:, known]):
-        sums = np.stack([np.bincount(members, one, minlength=count) for one in values])  # [S, scenes]
-        trainings = len(values)
-        each = (drawn @ sums.T) / pairs[:, None]  # [RESAMPLES, S]
-        weights = resamples(generator, trainings)
-        center = each.mean(axis=1)
-        deviation = (each * weights).sum(axis=1) / trainings - center
-        means.append(center + deviation * math.sqrt(trainings / max(trainings - 1, 1)))
-    return percentile_interval(means[1] - means[0])
 
 
 def table(figures: Sequence[SeedFigure], a: str, b: str) -> Table:
@@ -129,7 +90,7 @@ def table(figures: Sequence[SeedFigure], a: str, b: str) -> Table:
     note = (
         f"Means ± standard deviations over {seeds[0]} and {seeds[1]} trainings; {b} − {a} with its "
         f"{100 * LEVEL:g} % interval by bootstrap over trainings and scenes ({RESAMPLES} resamples, seed "
-        f"{SEED}; {UNKNOWN}: the figure is not one of single pairs)."
+        f"{SEED}; {UNKNOWN}: a run does not hold the figure by scenes)."
     )
     rows = tuple(
         (one.figure, _spread(one.a), _spread(one.b), signed(one.difference, 3), bounds(one.interval))

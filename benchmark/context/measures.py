@@ -1,7 +1,7 @@
 """Three measures of what the context does for a forecast: gain, right-context advantage, compliance.
 
 Each is over three sets of pairs: all, the hardest 10 % (of the Kalman filter), turns that begin after now.
-Intervals are those of ``benchmark.compare``: 95 %, by bootstrap over scenes.
+Intervals are those of ``benchmark.bootstrap``: 95 %, over scenes.
 """
 
 import math
@@ -13,11 +13,11 @@ import numpy as np
 
 from benchmark.answers import read_answers
 from benchmark.archive import Archive
-from benchmark.compare import bootstrap_interval
+from benchmark.bootstrap import mean_interval
 from benchmark.context.cases import Case, Cases, Change
 from benchmark.errors import BenchmarkError
 from benchmark.plan import PlannedScene
-from benchmark.results import Estimate
+from benchmark.results import ALL, COMPLIANCE, NO_CONTEXT_OFF_ROAD, OFF_ROAD, Estimate
 from cab_forecast import forecasts
 from model.arrays import Bools, Floats, Ints
 from model.data.checks import FUTURE_STEPS, STEPS_AHEAD
@@ -27,7 +27,6 @@ from model.metrics.offroad import off_road
 from model.metrics.path_fan import on_road_path_exists
 from model.metrics.turns import turns_after_now
 
-ALL: Final = "all"
 HARDEST: Final = "hardest 10 %"
 TURNS: Final = "turns after now"
 HARD_SHARE: Final = 0.1
@@ -67,6 +66,15 @@ class ContextFigures:
             "map_control_size_m": np.abs(control),
         }
 
+    def of_pairs(self, no_context_fde_m: Floats) -> dict[str, Floats]:
+        """Return ``differences`` and what compliance is computed of, [N] each, by their names in the results.
+
+        Args:
+            no_context_fde_m: [N], m, FDE of the model without context.
+        """
+        counts = {OFF_ROAD: self.off_road, NO_CONTEXT_OFF_ROAD: self.no_context_off_road}
+        return self.differences(no_context_fde_m) | counts
+
 
 def measure_context(
     figures: ContextFigures, no_context_fde_m: Floats, subsets: Mapping[str, Bools], scenes: Ints
@@ -83,7 +91,7 @@ def measure_context(
     found: dict[str, dict[str, Estimate]] = {}
     for subset, members in subsets.items():
         estimates = {name: _mean(values[members], scenes[members]) for name, values in differences.items()}
-        estimates["compliance"] = _compliance(
+        estimates[COMPLIANCE] = _compliance(
             figures.off_road[members], figures.no_context_off_road[members], scenes[members]
         )
         found[subset] = {name: one for name, one in estimates.items() if one.pairs}
@@ -231,7 +239,7 @@ def _mean(values: Floats, scenes: Ints) -> Estimate:
     values, scenes = values[known], scenes[known]
     if not len(values):
         return Estimate(math.nan, math.nan, math.nan, 0)
-    return Estimate(float(values.mean()), *bootstrap_interval(values, scenes), len(values))
+    return Estimate(float(values.mean()), *mean_interval(values, scenes), len(values))
 
 
 def _compliance(off: Floats, no_context_off: Floats, scenes: Ints) -> Estimate:
@@ -241,5 +249,5 @@ def _compliance(off: Floats, no_context_off: Floats, scenes: Ints) -> Estimate:
     total = float(no_context_off.sum())
     if not total:
         return Estimate(math.nan, math.nan, math.nan, 0)
-    low, high = bootstrap_interval(off, scenes, no_context_off)
+    low, high = mean_interval(off, scenes, no_context_off)
     return Estimate(1 - float(off.sum()) / total, 1 - high, 1 - low, len(off))

@@ -21,7 +21,7 @@ from benchmark.in_process import replay_in_process
 from benchmark.models import describe, select
 from benchmark.plan import PlannedScene
 from benchmark.replay import Replay, Replayed
-from benchmark.results import BenchmarkResults, ContextRun, Estimate
+from benchmark.results import FDE, BenchmarkResults, ContextRun, Estimate
 from cab.forecast.v1.model_service_pb2 import Model
 from cab_forecast import AsyncClient
 from model.arrays import Floats
@@ -31,7 +31,6 @@ FOLDER: Final = "context"
 """Folder of the answers about the cases, inside that of the run."""
 _TIMED: Final = "timed"
 _SECONDS: Final = "seconds"
-_FDE: Final = "fde_ml_6s_m"
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,7 @@ class ContextEvaluated:
     missing: Mapping[str, int]
     """Number of cases without a forecast, by ``name@version``."""
     each: Mapping[str, Floats]
-    """[pairs], m, differences of errors by ``<name@version>/<name>``, NaN where unknown."""
+    """[pairs], figures of each pair by ``<name@version>/<name>``, NaN where unknown."""
     refusals: Sequence[Refusal]
     """Calls that the endpoint refused."""
 
@@ -172,13 +171,13 @@ class ContextBenchmark:
         with Archive(self.folder / FOLDER, read_only=True) as archive:
             archive.check(self._properties())
             for model in models:
-                own = evaluated.instances.figures.get(f"{model}/{_FDE}")
+                own = evaluated.instances.figures.get(f"{model}/{FDE}")
                 if own is None:
                     continue
                 figures = evaluation.figures(archive, model, own, tick)
                 measures[model] = measure_context(figures, no_context_fde_m, subsets, evaluation.scene_of)
                 missing[model] = figures.missing
-                for name, values in figures.differences(no_context_fde_m).items():
+                for name, values in figures.of_pairs(no_context_fde_m).items():
                     each[f"{model}/{name}"] = values
             run = ContextRun(reference, self.settings.donors, len(self.cases), *_durations(archive))
             refusals = [one for one in archive.refusals() if one.model in models]

@@ -8,7 +8,7 @@ from types import MappingProxyType
 import numpy as np
 import pytest
 
-from benchmark.compare import Comparison, Difference, bootstrap_interval, compare, markdown, table
+from benchmark.compare import Comparison, Difference, compare, markdown, table
 from benchmark.errors import BenchmarkError
 from benchmark.results import INSTANCES_FILE, BenchmarkResults, Instances
 from model.arrays import Floats, Ints
@@ -214,41 +214,6 @@ def test_figures_of_another_number_of_pairs_are_refused(tmp_path: Path) -> None:
     b = saved(tmp_path / "b", made_results(), {FDE: np.zeros(PAIRS - 1)})
     with pytest.raises(BenchmarkError, match=INSTANCES_FILE):
         compare(a, b)
-
-
-def test_the_interval_is_a_bootstrap_over_scenes_by_hand() -> None:
-    """Two scenes give three means: both times the first, one of each, both times the second."""
-    values, scenes = np.array([1.0, 1.0, 1.0, 5.0]), np.array([3, 3, 3, 7])
-    assert bootstrap_interval(values, scenes) == (1.0, 5.0)
-    three = bootstrap_interval(np.array([0.0, 0.0, 6.0]), np.array([0, 1, 2]))
-    # All three are the last scene with probability 1/27 > 0.025, none is with 8/27
-    assert three == (0.0, 6.0)
-
-
-def test_the_interval_of_a_ratio_by_hand() -> None:
-    """As above, with the sums 3 and 5 over 2 and 0; twice the second scene has no ratio and is left out."""
-    values, scenes = np.array([1.0, 2.0, 5.0]), np.array([3, 3, 7])
-    assert bootstrap_interval(values, scenes, np.array([1.0, 1.0, 0.0])) == (1.5, 4.0)
-    assert bootstrap_interval(values, scenes, np.ones(3)) == bootstrap_interval(values, scenes)
-    assert np.isnan(bootstrap_interval(values, scenes, np.zeros(3))).all()
-
-
-def test_the_interval_of_many_scenes_is_that_of_the_normal_distribution() -> None:
-    """Scenes of 4 equal pairs: pairs taken as independent would halve the interval."""
-    scenes = np.repeat(np.arange(400), 4)
-    values = np.repeat(np.random.default_rng(5).normal(1.0, 2.0, 400), 4)
-    low, high = bootstrap_interval(values, scenes)
-    error = values[::4].std() / 20
-    assert low == pytest.approx(values.mean() - 1.96 * error, abs=0.2 * error)
-    assert high == pytest.approx(values.mean() + 1.96 * error, abs=0.2 * error)
-    assert bootstrap_interval(values, scenes) == (low, high)
-    order = np.random.default_rng(6).permutation(len(values))
-    assert bootstrap_interval(values[order], scenes[order]) == pytest.approx((low, high))
-
-
-def test_one_scene_has_no_interval() -> None:
-    for scenes in ([], [4, 4]):
-        assert np.isnan(bootstrap_interval(np.ones(len(scenes)), np.array(scenes, dtype=np.int64))).all()
 
 
 def test_a_difference_of_one_scene_alone_is_not_clear(tmp_path: Path) -> None:

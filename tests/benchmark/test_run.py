@@ -15,11 +15,11 @@ import pytest
 from benchmark.archive import Archive
 from benchmark.context import ContextSettings
 from benchmark.errors import BenchmarkError
-from benchmark.evaluate import Evaluated
+from benchmark.evaluate import CONSISTENCY, Evaluated
 from benchmark.explanations import FILE, ExplanationSettings
 from benchmark.models import BASELINES, select
 from benchmark.replay import Replayed
-from benchmark.results import BenchmarkResults
+from benchmark.results import BenchmarkResults, Instances
 from benchmark.run import IN_PROCESS, Benchmark, Endpoint, Progress, listed_models, run_benchmark
 from benchmark.tables import markdown
 from cab.forecast.v1.model_service_pb2 import Model
@@ -291,7 +291,14 @@ def test_one_call_runs_a_whole_benchmark_in_process(tmp_path: Path, server: Serv
     assert local.results.missing == remote.results.missing == 0
     assert {one.key for one in local.results.models} == {one.key for one in remote.results.models}
     theirs = {one.key: one for one in remote.results.models}
+    held = Instances.read(tmp_path / "local", local.results.pairs)
     for model in local.results.models:
+        for name in (*CONSISTENCY, "fde_hardest_3_m", "fde_merged_6s_m", "nll"):
+            ratio = held.ratio(model.key, name)
+            assert (ratio is None) == (name not in model.metrics), name
+            if ratio is not None:
+                known = ratio.values.sum() / ratio.divisors.sum()
+                assert known == pytest.approx(model.metrics[name], nan_ok=True), name
         other = theirs[model.key]
         assert (model.protocol, model.trained_on) == (other.protocol, other.trained_on)
         assert (model.statuses, model.instants) == (other.statuses, other.instants)

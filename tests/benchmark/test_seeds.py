@@ -7,20 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmark.compare import bootstrap_interval
 from benchmark.errors import BenchmarkError
-from benchmark.results import BenchmarkResults, Instances
-from benchmark.seeds import compare_seeds, seed_interval, table
-from model.arrays import Floats, Ints
+from benchmark.results import BenchmarkResults, ContextRun, Instances
+from benchmark.seeds import compare_seeds, table
 from tests.benchmark.builders import made_metrics, made_model, made_results
 
 PAIRS = 40
 SCENES = np.repeat(np.arange(10), 4)
 FDE = "fde_ml_6s_m"
-
-
-def figures(seed: int, mean: float) -> Floats:
-    return np.random.default_rng(seed).normal(mean, 1.0, PAIRS)
 
 
 def saved(folder: Path, fde: dict[str, float], plan: str = "0123") -> Path:
@@ -36,46 +30,6 @@ def saved(folder: Path, fde: dict[str, float], plan: str = "0123") -> Path:
     return folder
 
 
-def test_a_single_training_has_the_interval_over_scenes() -> None:
-    a, b = figures(0, 8.0), figures(1, 7.0)
-    low, high = seed_interval(a[None], b[None], SCENES)
-    assert (low, high) == pytest.approx(bootstrap_interval(b - a, SCENES), abs=0.1)
-
-
-def test_trainings_that_differ_widen_the_interval() -> None:
-    a, b = np.stack([figures(0, 8.0)] * 3), np.stack([figures(1, 7.0)] * 3)
-    alike = seed_interval(a, b, SCENES)
-    apart = seed_interval(a, b + np.array([[-1.0], [0.0], [1.0]]), SCENES)
-    assert apart[0] < alike[0] - 0.3
-    assert apart[1] > alike[1] + 0.3
-
-
-def test_constants_by_hand() -> None:
-    a, b = np.full((2, PAIRS), 8.0), np.full((3, PAIRS), 7.0)
-    assert seed_interval(a, b, SCENES) == pytest.approx((-1.0, -1.0))
-    b[1] = 10.0
-    low, high = seed_interval(a, b, SCENES)
-    wider = math.sqrt(3 / 2)  # of the three drawn trainings, none or all are the second one
-    assert low == pytest.approx(0.0 - wider)
-    assert high == pytest.approx(0.0 + 2 * wider)
-
-
-def test_pairs_that_a_training_lacks_do_not_count() -> None:
-    a, b = np.full((1, PAIRS), 8.0), np.full((2, PAIRS), 7.0)
-    a[0, :4], b[1, 8:12] = np.nan, np.nan
-    b[0, :12] = 100.0
-    b[0, 4:8] = 7.0
-    assert seed_interval(a, b, SCENES) == pytest.approx((-1.0, -1.0))
-
-
-@pytest.mark.parametrize("scenes", [np.zeros(PAIRS, dtype=np.int64), np.arange(PAIRS)])
-def test_one_scene_tells_no_interval(scenes: Ints) -> None:
-    a, b = figures(0, 8.0)[None], figures(1, 7.0)[None]
-    if len(set(scenes.tolist())) > 1:
-        b[:, 1:] = np.nan
-    assert np.isnan(seed_interval(a, b, scenes)).all()
-
-
 def test_runs_of_trainings_are_compared(tmp_path: Path) -> None:
     runs = [
         saved(tmp_path / "0", {"trajectron": 8.5, "cab": 8.0}),
@@ -89,10 +43,30 @@ def test_runs_of_trainings_are_compared(tmp_path: Path) -> None:
     low, high = fde.interval
     assert low < -0.4 < high < 0
     assert "NLL" not in found  # no training has it
-    assert np.isnan(found["D, std"].interval).all()
+    assert np.isnan(found["D, std"].interval).all()  # not held by scenes
     rows = {row[0]: row[1:] for row in table(list(found.values()), "trajectron", "cab").rows}
     assert rows["FDE-ML 6 s"][:3] == ("8.600 ± 0.141", "8.200 ± 0.200", "-0.400")
     assert rows["D, std"][3] == "-"
+
+
+def test_figures_of_scenes_and_hard_cases_have_intervals(tmp_path: Path) -> None:
+    """D by 2 instants a scene; the hardest pairs are those of the last scene."""
+    runs = []
+    for seed, scale in enumerate((1.0, 3.0)):
+        run = saved(tmp_path / str(seed), {"trajectron": 8.0, "cab": 8.0 - scale})
+        held = Instances.read(run, PAIRS)
+        mismatch_m = np.where(SCENES == 9, 60.0, 1.0) + np.arange(float(PAIRS))
+        sums = {
+            f"{model.key}/dispersion_std_m": np.full((10, 2), (2 * size, 2.0))
+            for model, size in zip(BenchmarkResults.read(run).models, (scale, 2 * scale), strict=True)
+        }
+        figures = {**held.figures, f"kalman@1.0.0/{FDE}": mismatch_m}
+        replace(held, figures=figures, of_scenes=sums).write(run)
+        runs.append(run)
+    found = {one.figure: one for one in compare_seeds(runs, "trajectron", "cab")}
+    wider = math.sqrt(2)
+    assert found["D, std"].interval == pytest.approx((2 - wider - 2 * wider, 2 + wider + 2 * wider), abs=0.1)
+    assert found["FDE, hardest 3 %"].interval == pytest.approx((-2 - wider, -2 + wider))
 
 
 def test_a_run_of_other_pairs_is_refused(tmp_path: Path) -> None:
@@ -111,6 +85,15 @@ def test_runs_of_other_settings_are_refused(tmp_path: Path) -> None:
     runs = [saved(tmp_path / str(number), {"cab": 8.0}) for number in range(2)]
     replace(BenchmarkResults.read(runs[1]), samples=7).write(runs[1])
     with pytest.raises(BenchmarkError, match="other samples"):
+        compare_seeds(runs, "cab", "cab")
+
+
+def test_measures_of_the_context_by_other_models_are_refused(tmp_path: Path) -> None:
+    runs = [saved(tmp_path / str(number), {"cab": 8.0}) for number in range(2)]
+    for run, version in zip(runs, ("1.0.0", "2.0.0"), strict=True):
+        context = ContextRun(f"trajectron-no-context@{version}", 2, 5, 5, 1.0)
+        replace(BenchmarkResults.read(run), context=context).write(run)
+    with pytest.raises(BenchmarkError, match="other models without context"):
         compare_seeds(runs, "cab", "cab")
 
 

@@ -1,0 +1,98 @@
+"""The figures of each pair and scene that a run holds, from which intervals are computed."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmark.bootstrap import Ratio
+from benchmark.results import ALL, NO_CONTEXT_OFF_ROAD, OFF_ROAD, Estimate, Instances
+from tests.benchmark.builders import made_model
+
+PAIRS = 100
+SCENES = np.repeat(np.arange(10), 10)
+FDE_M = np.arange(PAIRS, dtype=float)
+MISMATCH_M = np.where(np.arange(PAIRS) < 90, 1.0, 50.0 + np.arange(PAIRS))
+MISMATCH_M[99] = np.nan
+INSTANCES = Instances(
+    {
+        "cab@1.0.0/fde_ml_6s_m": FDE_M,
+        "kalman@1.9.0/fde_ml_6s_m": np.full(PAIRS, 1.0),
+        "kalman@1.10.0/fde_ml_6s_m": MISMATCH_M,
+        f"cab@1.0.0/{OFF_ROAD}": np.where(SCENES == 0, 1.0, 0.0),
+        f"cab@1.0.0/{NO_CONTEXT_OFF_ROAD}": np.where(SCENES < 4, 1.0, 0.0),
+    },
+    SCENES,
+    {"cab@1.0.0/dispersion_std_m": np.stack([np.arange(10.0), np.full(10, 2.0)], axis=1)},
+)
+
+
+def value(ratio: Ratio | None) -> float:
+    assert ratio is not None
+    return float(ratio.values.sum() / ratio.divisors.sum())
+
+
+def test_a_mean_over_pairs() -> None:
+    ratio = INSTANCES.ratio("cab@1.0.0", "fde_ml_6s_m")
+    assert value(ratio) == FDE_M.mean()
+    assert ratio is not None
+    np.testing.assert_array_equal(ratio.scenes, SCENES)
+
+
+def test_the_hardest_are_ranked_by_the_newest_kalman_filter() -> None:
+    """3 of 99 pairs, as one has no mismatch: those with the largest."""
+    assert value(INSTANCES.ratio("cab@1.0.0", "fde_hardest_3_m")) == np.mean([96.0, 97.0, 98.0])
+    assert value(INSTANCES.ratio("cab@1.0.0", "fde_hardest_1_m")) == 98.0
+
+
+def test_compliance_is_one_less_the_ratio_of_off_road_rates() -> None:
+    assert value(INSTANCES.ratio("cab@1.0.0", "compliance")) == 0.75
+
+
+def test_a_mean_over_instants() -> None:
+    assert value(INSTANCES.ratio("cab@1.0.0", "dispersion_std_m")) == 45 / 20
+
+
+@pytest.mark.parametrize(
+    ("model", "figure"),
+    [
+        ("cab@1.0.0", "nll"),
+        ("trajectron@1.0.0", "fde_ml_6s_m"),
+        ("trajectron@1.0.0", "fde_hardest_3_m"),
+        ("kalman@1.10.0", "compliance"),
+    ],
+)
+def test_what_a_run_does_not_hold(model: str, figure: str) -> None:
+    assert INSTANCES.ratio(model, figure) is None
+
+
+def test_nothing_is_ranked_without_a_kalman_filter() -> None:
+    figures = {"cab@1.0.0/fde_ml_6s_m": FDE_M}
+    assert Instances(figures, SCENES).ratio("cab@1.0.0", "fde_hardest_3_m") is None
+    figures["kalman@1.0.0/fde_ml_6s_m"] = np.full(PAIRS, np.nan)
+    assert Instances(figures, SCENES).ratio("cab@1.0.0", "fde_hardest_3_m") is None
+
+
+def test_without_scenes_there_are_no_ratios() -> None:
+    assert Instances(INSTANCES.figures).ratio("cab@1.0.0", "fde_ml_6s_m") is None
+
+
+def test_figures_are_written_and_read(tmp_path: Path) -> None:
+    INSTANCES.write(tmp_path)
+    found = Instances.read(tmp_path, PAIRS)
+    assert found.scenes is not None
+    np.testing.assert_array_equal(found.scenes, SCENES)
+    assert found.figures.keys() == INSTANCES.figures.keys()
+    for name, values in INSTANCES.figures.items():
+        np.testing.assert_array_equal(found.figures[name], values)
+    assert found.of_scenes.keys() == INSTANCES.of_scenes.keys()
+    for name, values in INSTANCES.of_scenes.items():
+        np.testing.assert_array_equal(found.of_scenes[name], values)
+
+
+def test_a_figure_is_a_metric_or_a_measure_of_the_context() -> None:
+    model = replace(made_model("cab"), context={ALL: {"gain_m": Estimate(1.25, 0.5, 2.0, 10)}})
+    assert model.figure("gain_m") == 1.25
+    assert model.figure("nll") == model.metrics["nll"]
+    assert np.isnan(model.figure("compliance"))
