@@ -85,7 +85,7 @@ class ContextRun:
     donors: int
     """Maximum number of donors of a pair."""
     cases: int
-    """Number of forecasts of each model with a changed context."""
+    """Number of forecasts of each learned model with a changed context; physics baselines see none."""
     timed: int
     """Number of forecasts that were timed: of all models, without those of replays that were killed."""
     seconds: float

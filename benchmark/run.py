@@ -380,7 +380,9 @@ async def _replay(
             replayed = await benchmark.replay(client, endpoint, models, tick)
         _note_rate(replayed, progress)
         if context is not None:
-            with progress.task(_CHANGED, len(context.cases) * len(models), "forecasts") as tick:
+            with progress.task(
+                _CHANGED, len(context.cases) * len(context.asked(models)), "forecasts"
+            ) as tick:
                 replayed = await context.replay(
                     client, models, endpoint.address, endpoint.concurrency, endpoint.timeout, tick
                 )
@@ -406,7 +408,7 @@ def _replay_in_process(
         replayed = benchmark.replay_in_process(chosen, tick)
     _note_rate(replayed, progress)
     if context is not None:
-        with progress.task(_CHANGED, len(context.cases) * len(models), "forecasts") as tick:
+        with progress.task(_CHANGED, len(context.cases) * len(context.asked(models)), "forecasts") as tick:
             replayed = context.replay_in_process(IN_PROCESS, chosen, tick)
         _note_rate(replayed, progress, " with a changed context")
     return models

@@ -7,6 +7,7 @@ Intervals are those of ``benchmark.bootstrap``: 95 %, over scenes.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -113,8 +114,9 @@ def context_subsets(scenes: Sequence[PlannedScene], mismatch_m: Floats | None) -
     return subsets
 
 
-def no_context_paths(archive: Archive, model: str, scenes: Sequence[PlannedScene]) -> Floats:
-    """Return the most likely trajectories of the model without context: [N, 12, 2], m; NaN where missing.
+def most_likely_paths(archive: Archive, model: str, scenes: Sequence[PlannedScene]) -> Floats:
+    """Return the most likely trajectories of a model with the pairs' own context: [N, 12, 2], m; NaN where
+    missing.
 
     Args:
         archive: answers of a benchmark of the same plan.
@@ -162,16 +164,15 @@ class ContextEvaluation:
 
     def figures(
         self,
-        archive: Archive,
-        model: str,
+        path_of: Callable[[Case], Floats | None],
         own_fde_m: Floats,
         tick: Callable[[int], None] = lambda cases: None,
     ) -> ContextFigures:
         """Return the figures of one model.
 
         Args:
-            archive: the saved answers about the cases.
-            model: ``name@version``.
+            path_of: returns the most likely trajectory in a case, [12, 2], m; None: missing. See ``answers``
+                and ``unchanged``.
             own_fde_m: [N], m, FDE at 6 s with the pair's own context.
             tick: called with the number of cases that are done.
 
@@ -183,7 +184,7 @@ class ContextEvaluation:
         numbers = {change: np.zeros(count) for change in Change}
         off_roads, compared = np.zeros((2, count)), np.zeros(count)
         for case, passable in zip(self._cases, self._passable, strict=True):
-            path = self._path(archive, model, case)
+            path = path_of(case)
             if path is not None:
                 error_m = displacement_m(path, self._truth[case.number])
                 sums[case.change][case.number] += fde_m(error_m, HORIZON_S)
@@ -199,6 +200,24 @@ class ContextEvaluation:
             means = {change: sums[change] / numbers[change] for change in Change}
         missing = len(self._cases) - int(sum(found.sum() for found in numbers.values()))
         return ContextFigures(own_fde_m, means, off_roads[0], off_roads[1], missing)
+
+    def answers(self, archive: Archive, model: str) -> Callable[[Case], Floats | None]:
+        """Return the trajectories of a model that was asked about the cases.
+
+        Args:
+            archive: the saved answers about the cases.
+            model: ``name@version``.
+        """
+        return partial(self._path, archive, model)
+
+    @staticmethod
+    def unchanged(paths: Floats) -> Callable[[Case], Floats | None]:
+        """Return the trajectories of a model that sees no context: in any case those with the own one.
+
+        Args:
+            paths: [N, 12, 2], m; NaN where missing.
+        """
+        return lambda case: paths[case.number] if np.isfinite(paths[case.number]).all() else None
 
     def _path(self, archive: Archive, model: str, case: Case) -> Floats | None:
         agent = self._agents[case.number]

@@ -13,12 +13,12 @@ from benchmark.context.measures import (
     ContextEvaluation,
     context_subsets,
     measure_context,
-    no_context_paths,
+    most_likely_paths,
 )
 from benchmark.errors import BenchmarkError
 from benchmark.evaluate import Evaluated
 from benchmark.in_process import replay_in_process
-from benchmark.models import describe, select
+from benchmark.models import BASELINES, describe, is_learned, select
 from benchmark.plan import PlannedScene
 from benchmark.replay import Replay, Replayed
 from benchmark.results import FDE, BenchmarkResults, ContextRun, Estimate
@@ -83,6 +83,11 @@ class ContextBenchmark:
         """All cases."""
         return Cases(self.scenes, self.settings.donors, self.seed)
 
+    @staticmethod
+    def asked(models: Mapping[str, Model]) -> dict[str, Model]:
+        """Return the models that are asked; physics baselines are not, since they see no context."""
+        return {key: model for key, model in models.items() if is_learned(model)}
+
     def check(self, models: Sequence[str]) -> None:
         """Refuse to begin without a model to compare with.
 
@@ -126,8 +131,9 @@ class ContextBenchmark:
             BenchmarkError: the folder holds answers of another run, or the endpoint does not answer.
         """
         with self._bound_archive(address, models) as archive:
-            cases = self._unanswered(archive, list(models), tick)
-            replay = Replay(cases, models, self.protocol, concurrency, patience)
+            asked = self.asked(models)
+            cases = self._unanswered(archive, list(asked), tick)
+            replay = Replay(cases, asked, self.protocol, concurrency, patience)
             return _timed(archive, await replay.run(client, archive, tick))
 
     def replay_in_process(
@@ -145,8 +151,10 @@ class ContextBenchmark:
         """
         models = {name: describe(one.info) for name, one in forecasters.items()}
         with self._bound_archive(address, models) as archive:
-            cases = self._unanswered(archive, list(models), tick)
-            return _timed(archive, replay_in_process(cases, forecasters, self.protocol, archive, tick))
+            asked = self.asked(models)
+            cases = self._unanswered(archive, list(asked), tick)
+            chosen = {name: forecasters[name] for name in asked}
+            return _timed(archive, replay_in_process(cases, chosen, self.protocol, archive, tick))
 
     def evaluate(
         self, models: Sequence[str], evaluated: Evaluated, tick: Callable[[int], None] = lambda cases: None
@@ -162,9 +170,7 @@ class ContextBenchmark:
             BenchmarkError: answers are missing, are those of another run, or do not fit their calls.
         """
         folder, reference = self._no_context()
-        with Archive(folder, read_only=True) as archive:
-            paths = no_context_paths(archive, reference, self.scenes)
-        evaluation = ContextEvaluation(self.cases, self.scenes, paths)
+        evaluation = ContextEvaluation(self.cases, self.scenes, self._paths(folder, reference))
         no_context_fde_m = evaluation.no_context_fde_m()
         subsets = context_subsets(self.scenes, evaluated.mismatch_m)
         measures, missing, each = {}, {}, {}
@@ -174,7 +180,11 @@ class ContextBenchmark:
                 own = evaluated.instances.figures.get(f"{model}/{FDE}")
                 if own is None:
                     continue
-                figures = evaluation.figures(archive, model, own, tick)
+                if model.partition("@")[0] in BASELINES:
+                    path_of = evaluation.unchanged(self._paths(self.folder, model))
+                else:
+                    path_of = evaluation.answers(archive, model)
+                figures = evaluation.figures(path_of, own, tick)
                 measures[model] = measure_context(figures, no_context_fde_m, subsets, evaluation.scene_of)
                 missing[model] = figures.missing
                 for name, values in figures.of_pairs(no_context_fde_m).items():
@@ -182,6 +192,11 @@ class ContextBenchmark:
             run = ContextRun(reference, self.settings.donors, len(self.cases), *_durations(archive))
             refusals = [one for one in archive.refusals() if one.model in models]
             return ContextEvaluated(run, measures, missing, each, refusals)
+
+    def _paths(self, folder: Path, model: str) -> Floats:
+        """Return the most likely trajectories of a model's answers in a benchmark's folder: [N, 12, 2], m."""
+        with Archive(folder, read_only=True) as archive:
+            return most_likely_paths(archive, model, self.scenes)
 
     def _no_context(self) -> tuple[Path, str]:
         """Return the folder with answers of the model without context, and its ``name@version``."""

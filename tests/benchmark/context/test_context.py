@@ -11,6 +11,7 @@ from benchmark.context import ContextSettings
 from benchmark.errors import BenchmarkError
 from benchmark.results import BenchmarkResults, Estimate
 from benchmark.run import Benchmark, run_benchmark
+from model.baselines.kalman import baselines
 from model.forecaster import Forecaster, Protocol
 from model.metrics.pairs import Sampling
 from tests.benchmark.context.worlds import WORLDS, Follower
@@ -69,6 +70,19 @@ def test_who_looks_at_one_of_them_has_the_advantage_of_that_one(results: Benchma
 def test_who_is_blind_has_neither_gain_nor_advantage(results: BenchmarkResults) -> None:
     for name, found in measures(results, "neither").items():
         assert (found.value, found.low, found.high) == (0, 0, 0), name
+
+
+def test_physics_baselines_are_not_asked_again(tmp_path: Path) -> None:
+    """They see no context, so that in any case they forecast as with the own one."""
+    (kalman,) = baselines()
+    results = run(tmp_path, NEITHER, kalman)
+    assert results.context is not None
+    assert results.context.timed == results.context.cases
+    assert results.missing == 0
+    found = measures(results, "kalman")
+    assert found["gain_m"].pairs == found["map_advantage_m"].pairs == len(WORLDS)
+    for name in ("map_advantage_m", "neighbors_advantage_m", "map_control_m", "map_control_size_m"):
+        assert (found[name].value, found[name].low, found[name].high) == (0, 0, 0), name
 
 
 def test_turns_that_begin_after_now_are_measured_apart(results: BenchmarkResults) -> None:
