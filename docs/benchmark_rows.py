@@ -1,19 +1,22 @@
-"""Rows of the benchmark figures in docs/data: ``python -m docs.benchmark_rows CAUSAL/results.json …``.
+"""Benchmark figures in docs/data: ``python -m docs.benchmark_rows CAUSAL/results.json …``.
 
 Each file is the results of ``cab-forecast benchmark`` on train_val. Rows of its models replace those of the
-same name and protocol; all others stay. ``make docs`` then renews the tables.
+same name and protocol; all others stay. With ``--seeds A B`` each file is of a training of A or B, and these
+two are compared instead (``benchmark.seeds``). ``make docs`` then renews the tables.
 """
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from packaging.version import Version
 
-from docs.generate import BENCHMARK, Row
+from benchmark.results import BenchmarkResults
+from benchmark.seeds import compare_seeds
+from docs.generate import BENCHMARK, SEEDS, Row
 
 Metrics = Mapping[str, float | None]
 
@@ -70,8 +73,7 @@ def with_results(data: dict[str, list[Row]], results: Mapping[str, Any]) -> dict
     Raises:
         ValueError: the results are of a part of the pairs, or of another split than train_val.
     """
-    if results["split"] != "train_val" or results["limit"] is not None:
-        raise ValueError("the tables hold figures of the whole of train_val")
+    _check_whole(results["split"], results["limit"])
     protocol = results["protocol"]
     made: dict[str, Callable[[Metrics], Row]] = {f"displacement_{protocol}": displacement_row}
     if protocol == "causal":
@@ -89,6 +91,16 @@ def with_results(data: dict[str, list[Row]], results: Mapping[str, Any]) -> dict
             if whole:
                 renewed[table][label] = row
     return {table: list(rows.values()) for table, rows in renewed.items()}
+
+
+def _check_whole(split: str, limit: int | None) -> None:
+    """Refuse figures of other pairs.
+
+    Raises:
+        ValueError: they are of a part of the pairs, or of another split than train_val.
+    """
+    if split != "train_val" or limit is not None:
+        raise ValueError("the tables hold figures of the whole of train_val")
 
 
 def _labels(models: list[Mapping[str, Any]]) -> list[str]:
@@ -122,18 +134,54 @@ def _all_or_none(values: list[int | None]) -> list[int | None] | None:
     return None if None in values else values
 
 
+def with_comparison(
+    data: Mapping[str, list[Row]], runs: Sequence[Path], names: tuple[str, str]
+) -> dict[str, list[Row]]:
+    """Return the comparisons over trainings with that of two models, under the runs' protocol.
+
+    Args:
+        data: a row for each figure by protocol.
+        runs: folders of benchmarks on train_val, each of a training of one of the models or both.
+        names: names of the two models.
+
+    Raises:
+        ValueError: a run is of a part of the pairs, or of another split than train_val.
+        BenchmarkError: the runs cannot be compared.
+    """
+    results = [BenchmarkResults.read(run) for run in runs]
+    for one in results:
+        _check_whole(one.split, one.limit)
+    rows = [
+        {
+            "figure": one.figure,
+            names[0]: [round(value, 4) for value in one.a],
+            names[1]: [round(value, 4) for value in one.b],
+            "interval": [None if math.isnan(bound) else round(bound, 4) for bound in one.interval],
+        }
+        for one in compare_seeds(runs, *names)
+    ]
+    return {**data, results[0].protocol.value: rows}
+
+
 def main(
     results: Annotated[list[Path], typer.Argument(help="results.json of benchmarks on train_val")],
+    seeds: Annotated[
+        tuple[str, str] | None, typer.Option(metavar="A B", help="Compare two models over their trainings.")
+    ] = None,
 ) -> None:
-    """Renew the rows of the models of each results file in ``docs/data``."""
-    data = json.loads(BENCHMARK.read_text(encoding="utf-8"))
-    for file in results:
-        data = with_results(data, json.loads(file.read_text(encoding="utf-8")))
+    """Renew the rows of each file's models in ``docs/data``, or the comparison over trainings."""
+    file = BENCHMARK if seeds is None else SEEDS
+    data = json.loads(file.read_text(encoding="utf-8"))
+    if seeds is not None:
+        data = with_comparison(data, [one.parent for one in results], seeds)
+    else:
+        for one in results:
+            data = with_results(data, json.loads(one.read_text(encoding="utf-8")))
     tables = [
         f"  {json.dumps(table)}: [\n" + ",\n".join(f"    {json.dumps(row)}" for row in rows) + "\n  ]"
         for table, rows in data.items()
     ]
-    BENCHMARK.write_text("{\n" + ",\n".join(tables) + "\n}\n", encoding="utf-8")
+    file.write_text("{\n" + ",\n".join(tables) + "\n}\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -5,22 +5,30 @@ between the two is written from the code or the data file; the rest of the page 
 """
 
 import json
+import math
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import typer
 
+from benchmark.compare import KEY_FIGURES
+from benchmark.seeds import SeedFigure
+from benchmark.seeds import table as seeds_comparison
 from cli.main import app
 from docs import contract_reference
 from docs.tables import table
 from loadtest.peers.report import Comparisons
+from model.evaluation.published import published_figures
 from service.settings_reference import settings_reference
 
 DOCS = Path(__file__).resolve().parent
 BENCHMARK = DOCS / "data/benchmark_train_val.json"
 """Benchmark figures of the bundled checkpoints on nuScenes train_val."""
+SEEDS = DOCS / "data/seeds_train_val.json"
+"""Figures of two methods over their trainings on nuScenes train_val, by protocol."""
 PEERS = DOCS / "data/peers.json"
 """Comparison with other servers, as ``make peers`` writes it."""
 INPUT_CHECKS = DOCS / "data/input_checks.json"
@@ -211,6 +219,68 @@ def consistency_table() -> str:
     )
 
 
+def paper_table(protocol: str) -> str:
+    """Return the models that the paper tabulates: figures of ours at 6 s, with the paper's in brackets."""
+    rows: dict[str, Row] = {}
+    for row in benchmark(f"displacement_{protocol}"):
+        if published_figures(row["model"]):
+            rows[row["model"]] = dict(row)
+    if protocol == "causal":
+        for row in benchmark("consistency_causal"):
+            if row["model"] in rows:
+                rows[row["model"]] |= row
+    columns: dict[str, tuple[str, Callable[[Row], float | None]]] = {
+        "ADE": ("ade_ml_6s_m", lambda row: row["ade"][5]),
+        "FDE": ("fde_ml_6s_m", lambda row: row["fde"][5]),
+        "OffR": ("off_road_ml", lambda row: row["off_road"]),
+        "FDE-f": ("fde_f_6s_m", lambda row: row["sampled_fde"]),
+        "OffR-f": ("off_road_f", lambda row: row["sampled_off_road"]),
+        "D, std": ("dispersion_std_m", lambda row: row.get("dispersion_std")),
+        "D, mean": ("dispersion_mean_m", lambda row: row.get("dispersion_mean")),
+        "C(1 m)": ("convergence_1m_s", lambda row: row.get("convergence_1")),
+        "hardest 3 %": ("fde_hardest_3_m", lambda row: row.get("hardest_fde_1_2_3", [None] * 3)[2]),
+    }
+    shown = {
+        heading: column
+        for heading, column in columns.items()
+        if any(column[1](row) is not None for row in rows.values())
+    }
+    return table(
+        ["model", *shown],
+        [
+            [model, *(_beside_paper(model, protocol, name, get(row)) for name, get in shown.values())]
+            for model, row in rows.items()
+        ],
+    )
+
+
+def _beside_paper(model: str, protocol: str, metric: str, value: float | None) -> str:
+    """Return our figure, as mean ± standard deviation if there are several trainings, and the paper's."""
+    ours, paper = _two(value), published_figures(model).get(metric)
+    for row in seeds(protocol):
+        if KEY_FIGURES[row["figure"]] == metric and model in row:
+            ours = f"{np.mean(row[model]):.2f} ± {np.std(row[model], ddof=1):.2f}"
+    return ours if paper is None else f"{ours} ({paper:.2f})"
+
+
+def seeds_table(protocol: str) -> str:
+    """Return the figures of two methods over their trainings, and the differences with their intervals."""
+    rows = seeds(protocol)
+    a, b = (name for name in rows[0] if name not in ("figure", "interval"))
+    figures = []
+    for row in rows:
+        low, high = (math.nan if bound is None else bound for bound in row["interval"])
+        figures.append(SeedFigure(row["figure"], tuple(row[a]), tuple(row[b]), (low, high)))
+    made = seeds_comparison(figures, a, b)
+    return table(made.columns, made.rows)
+
+
+def seeds(protocol: str) -> list[Row]:
+    """Return a row for each figure of two methods over their trainings."""
+    rows: list[Row] = json.loads(SEEDS.read_text(encoding="utf-8"))[protocol]
+    return rows
+
+
 def scale_table() -> str:
     """Return a row for each main figure, with those of three models from the simplest to the best."""
     models = ("constant-velocity-yaw", "trajectron-no-context", "cab")
@@ -262,6 +332,8 @@ PAGES: dict[str, dict[str, Callable[[], str]]] = {
         "merged_causal": merged_table,
         "consistency_causal": consistency_table,
         "displacement_paper": lambda: displacement_table("displacement_paper"),
+        "beside_paper_causal": lambda: paper_table("causal"),
+        "beside_paper_paper": lambda: paper_table("paper"),
     },
 }
 """Functions that write the generated parts, by page and name."""

@@ -1,12 +1,18 @@
 """Rows of the benchmark's tables in the documentation, from results files."""
 
 import json
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from docs.benchmark_rows import with_results
+from benchmark.results import Instances
+from docs import generate
+from docs.benchmark_rows import with_comparison, with_results
 from docs.generate import BENCHMARK
+from tests.benchmark.builders import made_metrics, made_model, made_results
 
 FIGURES = {
     **{f"{kind}_ml_{second}s_m": 0.123 + second for kind in ("ade", "fde") for second in range(1, 7)},
@@ -84,3 +90,44 @@ def test_a_protocol_takes_models_of_its_own_only() -> None:
 def test_figures_of_other_pairs_are_refused(change: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="whole of train_val"):
         with_results(data(), results(("cab", "9.0.0", "causal"), **change))
+
+
+def trainings(folder: Path, split: str = "train_val") -> list[Path]:
+    """Two runs, each with a training of two models."""
+    runs = []
+    for seed, (a, b) in enumerate([(8.0, 7.0), (9.0, 7.5)]):
+        runs.append(folder / str(seed))
+        runs[-1].mkdir()
+        fde = {"trajectron": a, "cab": b}
+        models = [made_model(name, metrics=made_metrics() | {"fde_ml_6s_m": fde[name]}) for name in fde]
+        replace(made_results(*models), split=split, limit=None, pairs=4).write(runs[-1])
+        each = {f"{model.key}/fde_ml_6s_m": np.full(4, fde[model.name]) for model in models}
+        Instances(each, np.array([0, 0, 1, 1])).write(runs[-1])
+    return runs
+
+
+def test_two_models_are_compared_over_their_trainings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = with_comparison({"causal": [], "paper": []}, trainings(tmp_path), ("trajectron", "cab"))
+    assert rows["paper"] == []
+    (fde,) = [row for row in rows["causal"] if row["figure"] == "FDE-ML 6 s"]
+    assert (fde["trajectron"], fde["cab"]) == ([8.0, 9.0], [7.0, 7.5])
+    assert fde["interval"][0] < -1.25 < fde["interval"][1]
+    (dispersion,) = [row for row in rows["causal"] if row["figure"] == "D, std"]
+    assert dispersion["interval"] == [None, None]
+    data = tmp_path / "seeds.json"
+    data.write_text(json.dumps(rows))
+    monkeypatch.setattr(generate, "SEEDS", data)
+    shown = generate.seeds_table("causal").splitlines()
+    assert shown[0] == "| figure | trajectron | cab | cab − trajectron | 95 % interval |"
+    (line,) = [one for one in shown if one.startswith("| FDE-ML 6 s |")]
+    assert line.startswith("| FDE-ML 6 s | 8.500 ± 0.707 | 7.250 ± 0.354 | -1.250 |")
+    beside = generate.paper_table("causal").splitlines()
+    (line,) = [one for one in beside if one.startswith("| trajectron |")]
+    assert " 8.50 ± 0.71 (10.45) " in line
+
+
+def test_trainings_on_a_part_of_the_pairs_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="whole of train_val"):
+        with_comparison({}, trainings(tmp_path, "train_fold"), ("trajectron", "cab"))
