@@ -24,14 +24,29 @@ LEVEL: Final = 0.95
 
 @dataclass(frozen=True)
 class Ratio:
-    """A figure of one model as a ratio of sums over N parts of a run, which are pairs or whole scenes."""
+    """A figure of one model as a ratio of sums over the S scenes of a run."""
 
-    values: Floats
-    """[N]; the figure is their sum over that of the divisors; NaN where missing."""
+    sums: Floats
+    """[S]; the figure is their sum over that of the divisors."""
     divisors: Floats
-    """[N], ≥ 0; ones where the figure is a mean."""
-    scenes: Ints
-    """[N], index of each part's scene."""
+    """[S], ≥ 0; numbers of pairs or instants where the figure is a mean."""
+
+    @classmethod
+    def of(cls, values: Floats, divisors: Floats, scenes: Ints) -> "Ratio":
+        """Return the ratio of the sum of some values over that of their divisors.
+
+        Args:
+            values: [N], NaN where missing.
+            divisors: [N], ≥ 0.
+            scenes: [N], index of each value's scene; there are as many scenes as the highest tells.
+        """
+        known = np.isfinite(values)
+        count = int(scenes.max(initial=-1)) + 1
+        sums, sizes = (
+            np.bincount(scenes[known], each[known], minlength=count).astype(np.float64)
+            for each in (values, divisors)
+        )
+        return cls(sums, sizes)
 
 
 def mean_interval(values: Floats, scenes: Ints, divisors: Floats | None = None) -> tuple[float, float]:
@@ -65,26 +80,21 @@ def difference_interval(a: Sequence[Ratio], b: Sequence[Ratio]) -> tuple[float, 
     training of each method it is the interval over scenes.
 
     Args:
-        a: a figure by each training of A, of the same N parts; parts that any training lacks do not count.
+        a: a figure by each training of A, over the same scenes.
         b: the same figure by each training of B.
 
     Returns:
         Lower and upper bound; NaN for fewer than two scenes, or if all divisors of a training are 0.
     """
-    known = np.isfinite(np.stack([one.values for one in (*a, *b)])).all(axis=0)
-    distinct, members = np.unique(a[0].scenes[known], return_inverse=True)
-    count = len(distinct)
+    count = len(a[0].sums)
     if count < 2:
         return math.nan, math.nan
     generator = np.random.default_rng(SEED)
     drawn = _resamples(generator, count)
     means = []
     for trainings in (a, b):
-        sums, sizes = (
-            np.stack([np.bincount(members, one[known], minlength=count) for one in parts])
-            for parts in ([one.values for one in trainings], [one.divisors for one in trainings])
-        )
-        totals = drawn @ sizes.T
+        sums = np.stack([one.sums for one in trainings])
+        totals = drawn @ np.stack([one.divisors for one in trainings]).T
         each = (drawn @ sums.T) / np.where(totals > 0, totals, np.nan)  # [RESAMPLES, S]
         weights = _resamples(generator, len(trainings))
         center = each.mean(axis=1)

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -209,8 +209,8 @@ class Instances:
     scenes: Ints | None = None
     """[pairs], index of each pair's scene; None in files of older versions."""
     of_scenes: Mapping[str, Floats] = field(default_factory=dict)
-    """[scenes, 2] by ``<name@version>/<figure>``, for means over instants (``evaluate.CONSISTENCY``): the
-    figure's sum over the scene's instants, and their number."""
+    """[scenes, 2] by ``<name@version>/<figure>``: sum and divisor of a figure over each scene, for figures
+    that are none of pairs (``evaluate.CONSISTENCY``), or that are kept in no other form."""
 
     def ratio(self, model: str, figure: str) -> Ratio | None:
         """Return a figure as a ratio of sums over the scenes; None: the run does not hold it so.
@@ -220,7 +220,7 @@ class Instances:
             figure: name of a metric or of a measure of the context.
         """
         if (sums := self.of_scenes.get(f"{model}/{figure}")) is not None:
-            return Ratio(sums[:, 0], sums[:, 1], np.arange(len(sums)))
+            return Ratio(sums[:, 0], sums[:, 1])
         if self.scenes is None:
             return None
         if figure == COMPLIANCE:
@@ -228,7 +228,25 @@ class Instances:
         if figure in HARDEST:
             return self._hardest(model, HARDEST[figure], self.scenes)
         values = self.figures.get(f"{model}/{figure}")
-        return None if values is None else Ratio(values, np.ones(len(values)), self.scenes)
+        return None if values is None else Ratio.of(values, np.ones(len(values)), self.scenes)
+
+    def by_scenes(self, models: Sequence[str], figures: Sequence[str]) -> "Instances":
+        """Return these figures over scenes alone, which take a hundredth of the room of those of pairs.
+
+        Args:
+            models: ``name@version`` of each.
+            figures: names of metrics or of measures of the context.
+        """
+        ratios = {f"{model}/{figure}": self.ratio(model, figure) for model in models for figure in figures}
+        return Instances(
+            {},
+            None,
+            {
+                name: np.stack([one.sums, one.divisors], axis=1)
+                for name, one in ratios.items()
+                if one is not None
+            },
+        )
 
     def mismatch_m(self) -> Floats | None:
         """Return the FDE at 6 s of the newest Kalman filter, which ranks the hard cases: [pairs], m; None: it
@@ -284,7 +302,7 @@ class Instances:
         off, reference = (self.figures.get(f"{model}/{name}") for name in (OFF_ROAD, NO_CONTEXT_OFF_ROAD))
         if off is None or reference is None:
             return None
-        return Ratio(reference - off, reference, scenes)
+        return Ratio.of(reference - off, reference, scenes)
 
     def _hardest(self, model: str, share: float, scenes: Ints) -> Ratio | None:
         fde_m, mismatch_m = self.figures.get(f"{model}/{FDE}"), self.mismatch_m()
@@ -292,7 +310,7 @@ class Instances:
             return None
         members = np.isfinite(mismatch_m)
         members[members] = hardest(mismatch_m[members], share)
-        return Ratio(np.where(members, fde_m, 0.0), members.astype(np.float64), scenes)
+        return Ratio.of(np.where(members, fde_m, 0.0), members.astype(np.float64), scenes)
 
 
 def _with_nan(document: Any) -> Any:

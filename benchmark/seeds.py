@@ -31,7 +31,8 @@ class SeedFigure:
     """Figure of each training of A."""
     b: tuple[float, ...]
     interval: tuple[float, float]
-    """95 % interval of the difference of the means, B − A; NaN where a run does not hold what it takes."""
+    """95 % interval of the difference of the means, B − A; NaN where a run does not hold the figure by
+    scenes, or where the trainings' figures are of different pairs."""
 
     @property
     def difference(self) -> float:
@@ -78,7 +79,8 @@ def compare_seeds(runs: Sequence[Path], a: str, b: str) -> list[SeedFigure]:
         interval = (math.nan, math.nan)
         each = [[own.ratio(model.key, metric) for model, own in one] for one in trainings]
         known = [[ratio for ratio in one if ratio is not None] for one in each]
-        if list(map(len, known)) == list(map(len, each)):
+        divisors = np.array([ratio.divisors for one in known for ratio in one])
+        if list(map(len, known)) == list(map(len, each)) and (divisors == divisors[0]).all():
             interval = difference_interval(*known)
         figures.append(SeedFigure(figure, values[0], values[1], interval))
     return figures
@@ -90,7 +92,7 @@ def table(figures: Sequence[SeedFigure], a: str, b: str) -> Table:
     note = (
         f"Means ± standard deviations over {seeds[0]} and {seeds[1]} trainings; {b} − {a} with its "
         f"{100 * LEVEL:g} % interval by bootstrap over trainings and scenes ({RESAMPLES} resamples, seed "
-        f"{SEED}; {UNKNOWN}: a run does not hold the figure by scenes)."
+        f"{SEED}; {UNKNOWN}: a run does not hold the figure by scenes, or lacks forecasts)."
     )
     rows = tuple(
         (one.figure, _spread(one.a), _spread(one.b), signed(one.difference, 3), bounds(one.interval))

@@ -2,7 +2,9 @@
 
 Each file is the results of ``cab-forecast benchmark`` on train_val. Rows of its models replace those of the
 same name and protocol; all others stay. With ``--seeds A B`` each file is of a training of A or B, and these
-two are compared instead (``benchmark.seeds``). ``make docs`` then renews the tables.
+two are compared instead (``benchmark.seeds``). With ``--keep NAME`` the one file's run is kept in
+docs/data/trainings/NAME, without the figures of single pairs, for comparisons with later trainings.
+``make docs`` then renews the tables.
 """
 
 import json
@@ -14,10 +16,13 @@ from typing import Annotated, Any
 import typer
 from packaging.version import Version
 
-from benchmark.results import BenchmarkResults
+from benchmark.compare import KEY_FIGURES
+from benchmark.results import BenchmarkResults, Instances
 from benchmark.seeds import compare_seeds
-from docs.generate import BENCHMARK, SEEDS, Row
+from docs.generate import BENCHMARK, DOCS, SEEDS, Row
 
+TRAININGS = DOCS / "data/trainings"
+"""Runs of trainings whose checkpoints are not bundled."""
 Metrics = Mapping[str, float | None]
 
 
@@ -163,13 +168,38 @@ def with_comparison(
     return {**data, results[0].protocol.value: rows}
 
 
+def keep(run: Path, folder: Path) -> None:
+    """Keep a run's results, and the figures of its models by scenes.
+
+    Args:
+        run: folder of a benchmark on train_val.
+        folder: where they are kept; created if missing.
+
+    Raises:
+        ValueError: the run is of a part of the pairs, or of another split than train_val.
+    """
+    results = BenchmarkResults.read(run)
+    _check_whole(results.split, results.limit)
+    instances = Instances.read(run, results.pairs)
+    folder.mkdir(parents=True, exist_ok=True)
+    results.write(folder)
+    instances.by_scenes([model.key for model in results.models], list(KEY_FIGURES.values())).write(folder)
+
+
 def main(
     results: Annotated[list[Path], typer.Argument(help="results.json of benchmarks on train_val")],
     seeds: Annotated[
         tuple[str, str] | None, typer.Option(metavar="A B", help="Compare two models over their trainings.")
     ] = None,
+    name: Annotated[
+        str | None, typer.Option("--keep", help="Keep the one run for comparisons with later trainings.")
+    ] = None,
 ) -> None:
     """Renew the rows of each file's models in ``docs/data``, or the comparison over trainings."""
+    if name is not None:
+        (one,) = results
+        keep(one.parent, TRAININGS / name)
+        return
     file = BENCHMARK if seeds is None else SEEDS
     data = json.loads(file.read_text(encoding="utf-8"))
     if seeds is not None:

@@ -30,14 +30,15 @@ INSTANCES = Instances(
 
 def value(ratio: Ratio | None) -> float:
     assert ratio is not None
-    return float(ratio.values.sum() / ratio.divisors.sum())
+    return float(ratio.sums.sum() / ratio.divisors.sum())
 
 
 def test_a_mean_over_pairs() -> None:
     ratio = INSTANCES.ratio("cab@1.0.0", "fde_ml_6s_m")
     assert value(ratio) == FDE_M.mean()
     assert ratio is not None
-    np.testing.assert_array_equal(ratio.scenes, SCENES)
+    np.testing.assert_array_equal(ratio.sums, FDE_M.reshape(10, 10).sum(axis=1))
+    np.testing.assert_array_equal(ratio.divisors, np.full(10, 10))
 
 
 def test_the_hardest_are_ranked_by_the_newest_kalman_filter() -> None:
@@ -89,6 +90,17 @@ def test_figures_are_written_and_read(tmp_path: Path) -> None:
     assert found.of_scenes.keys() == INSTANCES.of_scenes.keys()
     for name, values in INSTANCES.of_scenes.items():
         np.testing.assert_array_equal(found.of_scenes[name], values)
+
+
+def test_figures_over_scenes_alone_are_the_same(tmp_path: Path) -> None:
+    names = ("fde_ml_6s_m", "fde_hardest_3_m", "compliance", "dispersion_std_m", "nll")
+    kept = INSTANCES.by_scenes(["cab@1.0.0", "kalman@1.10.0"], names)
+    assert not kept.figures
+    kept.write(tmp_path)
+    found = Instances.read(tmp_path, PAIRS)
+    for name in names[:-1]:
+        assert value(found.ratio("cab@1.0.0", name)) == value(INSTANCES.ratio("cab@1.0.0", name))
+    assert found.ratio("cab@1.0.0", "nll") is None
 
 
 def test_a_figure_is_a_metric_or_a_measure_of_the_context() -> None:

@@ -297,7 +297,7 @@ def test_one_call_runs_a_whole_benchmark_in_process(tmp_path: Path, server: Serv
             ratio = held.ratio(model.key, name)
             assert (ratio is None) == (name not in model.metrics), name
             if ratio is not None:
-                known = ratio.values.sum() / ratio.divisors.sum()
+                known = ratio.sums.sum() / ratio.divisors.sum()
                 assert known == pytest.approx(model.metrics[name], nan_ok=True), name
         other = theirs[model.key]
         assert (model.protocol, model.trained_on) == (other.protocol, other.trained_on)

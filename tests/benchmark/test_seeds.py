@@ -69,6 +69,16 @@ def test_figures_of_scenes_and_hard_cases_have_intervals(tmp_path: Path) -> None
     assert found["FDE, hardest 3 %"].interval == pytest.approx((-2 - wider, -2 + wider))
 
 
+def test_trainings_that_lack_different_pairs_have_no_interval(tmp_path: Path) -> None:
+    runs = [saved(tmp_path / str(seed), {"trajectron": 8.0, "cab": 7.0}) for seed in range(2)]
+    held = Instances.read(runs[1], PAIRS)
+    lacking = {name: np.where(np.arange(PAIRS) == 3, np.nan, values) for name, values in held.figures.items()}
+    replace(held, figures=lacking).write(runs[1])
+    (fde,) = (one for one in compare_seeds(runs, "trajectron", "cab") if one.figure == "FDE-ML 6 s")
+    assert fde.difference == -1.0
+    assert np.isnan(fde.interval).all()
+
+
 def test_a_run_of_other_pairs_is_refused(tmp_path: Path) -> None:
     runs = [saved(tmp_path / "0", {"cab": 8.0}), saved(tmp_path / "1", {"cab": 8.0}, plan="4567")]
     with pytest.raises(BenchmarkError, match="other plan"):

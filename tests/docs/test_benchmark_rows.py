@@ -10,7 +10,7 @@ import pytest
 
 from benchmark.results import Instances
 from docs import generate
-from docs.benchmark_rows import with_comparison, with_results
+from docs.benchmark_rows import keep, with_comparison, with_results
 from docs.generate import BENCHMARK
 from tests.benchmark.builders import made_metrics, made_model, made_results
 
@@ -126,6 +126,17 @@ def test_two_models_are_compared_over_their_trainings(
     beside = generate.paper_table("causal").splitlines()
     (line,) = [one for one in beside if one.startswith("| trajectron |")]
     assert " 8.50 ± 0.71 (10.45) " in line
+
+
+def test_kept_runs_give_the_same_comparison(tmp_path: Path) -> None:
+    (tmp_path / "runs").mkdir()
+    runs = trainings(tmp_path / "runs")
+    kept = [tmp_path / "kept" / run.name for run in runs]
+    for run, folder in zip(runs, kept, strict=True):
+        keep(run, folder)
+    names = ("trajectron", "cab")
+    assert with_comparison({}, kept, names) == with_comparison({}, runs, names)
+    assert with_comparison({}, [kept[0], runs[1]], names) == with_comparison({}, runs, names)
 
 
 def test_trainings_on_a_part_of_the_pairs_are_refused(tmp_path: Path) -> None:
