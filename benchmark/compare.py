@@ -12,7 +12,17 @@ from pathlib import Path
 import numpy as np
 
 from benchmark.bootstrap import LEVEL, RESAMPLES, SEED, difference_interval, mean_interval
-from benchmark.results import COMPLIANCE, FDE, HARDEST, BenchmarkModelResult, BenchmarkResults, Instances
+from benchmark.results import (
+    ALL,
+    FDE,
+    HARDEST,
+    HARDEST_FDE,
+    TURNS,
+    BenchmarkModelResult,
+    BenchmarkResults,
+    Instances,
+    of_subset,
+)
 from model.arrays import Floats, Ints
 from model.evaluation.tables import UNKNOWN, Table, document, number, signed
 from model.metrics.consistency import RANGES_M
@@ -30,13 +40,19 @@ KEY_FIGURES = {
     "NLL": "nll",
     "D, std": "dispersion_std_m",
     **{f"C({range_m:g} m)": f"convergence_{range_m:g}m_s" for range_m in RANGES_M},
-    **{f"FDE, hardest {100 * share:g} %": name for name, share in HARDEST.items()},
-    "Gain by context": "gain_m",
-    "advantage of the right map": "map_advantage_m",
-    "advantage of the right neighbours": "neighbors_advantage_m",
-    "compliance": COMPLIANCE,
+    **{f"FDE, hardest {100 * share:g} %": name for name, share in HARDEST_FDE.items()},
+    **{
+        of_subset(heading, subset): of_subset(measure, subset)
+        for heading, measure in (
+            ("Gain", "gain_m"),
+            ("right map", "map_advantage_m"),
+            ("right neighbours", "neighbors_advantage_m"),
+            ("compliance", "compliance"),
+        )
+        for subset in (ALL, HARDEST, TURNS)
+    },
 }
-"""Metrics and measures of the context (over all pairs), by their names in tables."""
+"""Metrics and measures of the context, by their names in tables."""
 CLEAR = 2.0
 """Standard errors that a clear difference exceeds."""
 

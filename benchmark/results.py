@@ -36,17 +36,22 @@ PER_INSTANCE: Final = (
 )
 """Figures in ``instances.npz``, as ``<name@version>/<figure>`` [pairs], NaN where missing."""
 FDE: Final = "fde_ml_6s_m"
-HARDEST: Final = {f"fde_hardest_{round(100 * share)}_m": share for share in HARD_SHARES}
+HARDEST_FDE: Final = {f"fde_hardest_{round(100 * share)}_m": share for share in HARD_SHARES}
 """Shares of the pairs by the name of the mean FDE over them."""
 ALL: Final = "all"
-"""The subset of all pairs among the measures of the context."""
-COMPLIANCE: Final = "compliance"
-OFF_ROAD, NO_CONTEXT_OFF_ROAD = "donor_map_off_road", "donor_map_off_road_no_context"
-"""Figures of each pair that compliance is computed of: ``context.measures.ContextFigures``."""
+HARDEST: Final = "hardest 10 %"
+TURNS: Final = "turns after now"
+"""Subsets of the pairs, over which the use of the context is measured."""
 _SCENES: Final = "scenes"
 """Entry of ``instances.npz``: [pairs], the index of each pair's scene."""
+_OF: Final = " of "
 _OF_SCENES: Final = "of scenes/"
 """Beginning of the names of entries of ``instances.npz`` with a row for each scene."""
+
+
+def of_subset(measure: str, subset: str) -> str:
+    """Return the name of a measure of the context over a subset of the pairs, among a model's figures."""
+    return measure if subset == ALL else f"{measure}{_OF}{subset}"
 
 
 @dataclass(frozen=True)
@@ -136,8 +141,9 @@ class BenchmarkModelResult(ModelResult):
         return self.statuses.get("MISSING", 0) + self.statuses.get("INVALID", 0) + lost
 
     def figure(self, name: str) -> float:
-        """Return a metric, or a measure of the context over all pairs; NaN where it is unknown."""
-        measured = self.context.get(ALL, {}).get(name)
+        """Return a metric, or a measure of the context (see ``of_subset``); NaN where it is unknown."""
+        measure, _, subset = name.partition(_OF)
+        measured = self.context.get(subset or ALL, {}).get(measure)
         return self.metrics.get(name, math.nan) if measured is None else measured.value
 
     @property
@@ -210,7 +216,8 @@ class Instances:
     """[pairs], index of each pair's scene; None in files of older versions."""
     of_scenes: Mapping[str, Floats] = field(default_factory=dict)
     """[scenes, 2] by ``<name@version>/<figure>``: sum and divisor of a figure over each scene, for figures
-    that are none of pairs (``evaluate.CONSISTENCY``), or that are kept in no other form."""
+    that are no means over pairs (``evaluate.CONSISTENCY``, measures of the context), or that are kept in no
+    other form."""
 
     def ratio(self, model: str, figure: str) -> Ratio | None:
         """Return a figure as a ratio of sums over the scenes; None: the run does not hold it so.
@@ -223,10 +230,8 @@ class Instances:
             return Ratio(sums[:, 0], sums[:, 1])
         if self.scenes is None:
             return None
-        if figure == COMPLIANCE:
-            return self._compliance(model, self.scenes)
-        if figure in HARDEST:
-            return self._hardest(model, HARDEST[figure], self.scenes)
+        if figure in HARDEST_FDE:
+            return self._hardest(model, HARDEST_FDE[figure], self.scenes)
         values = self.figures.get(f"{model}/{figure}")
         return None if values is None else Ratio.of(values, np.ones(len(values)), self.scenes)
 
@@ -297,12 +302,6 @@ class Instances:
                 raise BenchmarkError(f"{file}: {name} is of {list(values.shape)}, not of {pairs} pairs")
         scenes = found.pop(_SCENES, None)
         return cls(found, scenes, of_scenes)
-
-    def _compliance(self, model: str, scenes: Ints) -> Ratio | None:
-        off, reference = (self.figures.get(f"{model}/{name}") for name in (OFF_ROAD, NO_CONTEXT_OFF_ROAD))
-        if off is None or reference is None:
-            return None
-        return Ratio.of(reference - off, reference, scenes)
 
     def _hardest(self, model: str, share: float, scenes: Ints) -> Ratio | None:
         fde_m, mismatch_m = self.figures.get(f"{model}/{FDE}"), self.mismatch_m()

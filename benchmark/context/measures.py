@@ -14,11 +14,11 @@ import numpy as np
 
 from benchmark.answers import read_answers
 from benchmark.archive import Archive
-from benchmark.bootstrap import mean_interval
+from benchmark.bootstrap import Ratio, mean_interval
 from benchmark.context.cases import Case, Cases, Change
 from benchmark.errors import BenchmarkError
 from benchmark.plan import PlannedScene
-from benchmark.results import ALL, COMPLIANCE, NO_CONTEXT_OFF_ROAD, OFF_ROAD, Estimate
+from benchmark.results import ALL, HARDEST, TURNS, Estimate, of_subset
 from cab_forecast import forecasts
 from model.arrays import Bools, Floats, Ints
 from model.data.checks import FUTURE_STEPS, STEPS_AHEAD
@@ -28,8 +28,6 @@ from model.metrics.offroad import off_road
 from model.metrics.path_fan import on_road_path_exists
 from model.metrics.turns import turns_after_now
 
-HARDEST: Final = "hardest 10 %"
-TURNS: Final = "turns after now"
 HARD_SHARE: Final = 0.1
 """Share of the pairs that are the hardest."""
 HORIZON_S: Final = 6.0
@@ -67,15 +65,6 @@ class ContextFigures:
             "map_control_size_m": np.abs(control),
         }
 
-    def of_pairs(self, no_context_fde_m: Floats) -> dict[str, Floats]:
-        """Return ``differences`` and what compliance is computed of, [N] each, by their names in the results.
-
-        Args:
-            no_context_fde_m: [N], m, FDE of the model without context.
-        """
-        counts = {OFF_ROAD: self.off_road, NO_CONTEXT_OFF_ROAD: self.no_context_off_road}
-        return self.differences(no_context_fde_m) | counts
-
 
 def measure_context(
     figures: ContextFigures, no_context_fde_m: Floats, subsets: Mapping[str, Bools], scenes: Ints
@@ -92,11 +81,33 @@ def measure_context(
     found: dict[str, dict[str, Estimate]] = {}
     for subset, members in subsets.items():
         estimates = {name: _mean(values[members], scenes[members]) for name, values in differences.items()}
-        estimates[COMPLIANCE] = _compliance(
+        estimates["compliance"] = _compliance(
             figures.off_road[members], figures.no_context_off_road[members], scenes[members]
         )
         found[subset] = {name: one for name, one in estimates.items() if one.pairs}
     return {subset: estimates for subset, estimates in found.items() if estimates}
+
+
+def measures_by_scenes(
+    figures: ContextFigures, no_context_fde_m: Floats, subsets: Mapping[str, Bools], scenes: Ints
+) -> dict[str, Ratio]:
+    """Return what the measures of one model are computed of, by ``results.of_subset`` of name and subset.
+
+    Args:
+        figures: the model's figures of N pairs.
+        no_context_fde_m: [N], m, FDE of the model without context.
+        subsets: [N] each, which pairs belong to a subset.
+        scenes: [N], index of each pair's scene.
+    """
+    ones = np.ones(len(scenes))
+    parts = {name: (values, ones) for name, values in figures.differences(no_context_fde_m).items()}
+    reference = figures.no_context_off_road
+    parts["compliance"] = (reference - figures.off_road, reference)
+    return {
+        of_subset(name, subset): Ratio.of(np.where(members, values, np.nan), divisors, scenes)
+        for subset, members in subsets.items()
+        for name, (values, divisors) in parts.items()
+    }
 
 
 def context_subsets(scenes: Sequence[PlannedScene], mismatch_m: Floats | None) -> dict[str, Bools]:

@@ -7,12 +7,15 @@ from functools import cached_property
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from benchmark.archive import Archive, Refusal
 from benchmark.context.cases import Cases, ContextSettings
 from benchmark.context.measures import (
     ContextEvaluation,
     context_subsets,
     measure_context,
+    measures_by_scenes,
     most_likely_paths,
 )
 from benchmark.errors import BenchmarkError
@@ -43,7 +46,9 @@ class ContextEvaluated:
     missing: Mapping[str, int]
     """Number of cases without a forecast, by ``name@version``."""
     each: Mapping[str, Floats]
-    """[pairs], figures of each pair by ``<name@version>/<name>``, NaN where unknown."""
+    """[pairs], m, differences of errors by ``<name@version>/<name>``, NaN where unknown."""
+    of_scenes: Mapping[str, Floats]
+    """[scenes, 2], sum and divisor of each measure by ``<name@version>/<name>``."""
     refusals: Sequence[Refusal]
     """Calls that the endpoint refused."""
 
@@ -58,7 +63,10 @@ class ContextEvaluated:
             for model in results.models
         )
         refusals = (*results.refusals, *map(str, self.refusals))
-        instances = replace(evaluated.instances, figures={**evaluated.instances.figures, **self.each})
+        held = evaluated.instances
+        instances = replace(
+            held, figures={**held.figures, **self.each}, of_scenes={**held.of_scenes, **self.of_scenes}
+        )
         return (
             replace(results, models=models, context=self.run, refusals=refusals),
             replace(evaluated, instances=instances),
@@ -173,7 +181,7 @@ class ContextBenchmark:
         evaluation = ContextEvaluation(self.cases, self.scenes, self._paths(folder, reference))
         no_context_fde_m = evaluation.no_context_fde_m()
         subsets = context_subsets(self.scenes, evaluated.mismatch_m)
-        measures, missing, each = {}, {}, {}
+        measures, missing, each, of_scenes = {}, {}, {}, {}
         with Archive(self.folder / FOLDER, read_only=True) as archive:
             archive.check(self._properties())
             for model in models:
@@ -185,13 +193,16 @@ class ContextBenchmark:
                 else:
                     path_of = evaluation.answers(archive, model)
                 figures = evaluation.figures(path_of, own, tick)
-                measures[model] = measure_context(figures, no_context_fde_m, subsets, evaluation.scene_of)
+                measured = (figures, no_context_fde_m, subsets, evaluation.scene_of)
+                measures[model] = measure_context(*measured)
+                for name, ratio in measures_by_scenes(*measured).items():
+                    of_scenes[f"{model}/{name}"] = np.stack([ratio.sums, ratio.divisors], axis=1)
                 missing[model] = figures.missing
-                for name, values in figures.of_pairs(no_context_fde_m).items():
+                for name, values in figures.differences(no_context_fde_m).items():
                     each[f"{model}/{name}"] = values
             run = ContextRun(reference, self.settings.donors, len(self.cases), *_durations(archive))
             refusals = [one for one in archive.refusals() if one.model in models]
-            return ContextEvaluated(run, measures, missing, each, refusals)
+            return ContextEvaluated(run, measures, missing, each, of_scenes, refusals)
 
     def _paths(self, folder: Path, model: str) -> Floats:
         """Return the most likely trajectories of a model's answers in a benchmark's folder: [N, 12, 2], m."""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmark.bootstrap import Ratio
-from benchmark.results import ALL, NO_CONTEXT_OFF_ROAD, OFF_ROAD, Estimate, Instances
+from benchmark.results import ALL, TURNS, Estimate, Instances, of_subset
 from tests.benchmark.builders import made_model
 
 PAIRS = 100
@@ -20,8 +20,6 @@ INSTANCES = Instances(
         "cab@1.0.0/fde_ml_6s_m": FDE_M,
         "kalman@1.9.0/fde_ml_6s_m": np.full(PAIRS, 1.0),
         "kalman@1.10.0/fde_ml_6s_m": MISMATCH_M,
-        f"cab@1.0.0/{OFF_ROAD}": np.where(SCENES == 0, 1.0, 0.0),
-        f"cab@1.0.0/{NO_CONTEXT_OFF_ROAD}": np.where(SCENES < 4, 1.0, 0.0),
     },
     SCENES,
     {"cab@1.0.0/dispersion_std_m": np.stack([np.arange(10.0), np.full(10, 2.0)], axis=1)},
@@ -45,10 +43,6 @@ def test_the_hardest_are_ranked_by_the_newest_kalman_filter() -> None:
     """3 of 99 pairs, as one has no mismatch: those with the largest."""
     assert value(INSTANCES.ratio("cab@1.0.0", "fde_hardest_3_m")) == np.mean([96.0, 97.0, 98.0])
     assert value(INSTANCES.ratio("cab@1.0.0", "fde_hardest_1_m")) == 98.0
-
-
-def test_compliance_is_one_less_the_ratio_of_off_road_rates() -> None:
-    assert value(INSTANCES.ratio("cab@1.0.0", "compliance")) == 0.75
 
 
 def test_a_mean_over_instants() -> None:
@@ -93,7 +87,7 @@ def test_figures_are_written_and_read(tmp_path: Path) -> None:
 
 
 def test_figures_over_scenes_alone_are_the_same(tmp_path: Path) -> None:
-    names = ("fde_ml_6s_m", "fde_hardest_3_m", "compliance", "dispersion_std_m", "nll")
+    names = ("fde_ml_6s_m", "fde_hardest_3_m", "dispersion_std_m", "nll")
     kept = INSTANCES.by_scenes(["cab@1.0.0", "kalman@1.10.0"], names)
     assert not kept.figures
     kept.write(tmp_path)
@@ -104,7 +98,8 @@ def test_figures_over_scenes_alone_are_the_same(tmp_path: Path) -> None:
 
 
 def test_a_figure_is_a_metric_or_a_measure_of_the_context() -> None:
-    model = replace(made_model("cab"), context={ALL: {"gain_m": Estimate(1.25, 0.5, 2.0, 10)}})
-    assert model.figure("gain_m") == 1.25
+    measures = {ALL: {"gain_m": Estimate(1.25, 0.5, 2.0, 10)}, TURNS: {"gain_m": Estimate(2.5, 1.0, 4.0, 3)}}
+    model = replace(made_model("cab"), context=measures)
+    assert (model.figure("gain_m"), model.figure(of_subset("gain_m", TURNS))) == (1.25, 2.5)
     assert model.figure("nll") == model.metrics["nll"]
     assert np.isnan(model.figure("compliance"))

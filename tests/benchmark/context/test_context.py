@@ -9,7 +9,7 @@ import pytest
 from benchmark.archive import Archive
 from benchmark.context import ContextSettings
 from benchmark.errors import BenchmarkError
-from benchmark.results import BenchmarkResults, Estimate
+from benchmark.results import BenchmarkResults, Estimate, Instances, of_subset
 from benchmark.run import Benchmark, run_benchmark
 from model.baselines.kalman import baselines
 from model.forecaster import Forecaster, Protocol
@@ -111,6 +111,12 @@ def test_results_are_written_and_read(tmp_path: Path) -> None:
         assert each["both@1.0.0/map_advantage_m"].mean() == pytest.approx(
             measures(results, "both")["map_advantage_m"].value
         )
+    held = Instances.read(tmp_path, results.pairs)
+    for subset in ("all", "turns after now"):
+        for name, found in measures(results, "both", subset).items():
+            ratio = held.ratio("both@1.0.0", of_subset(name, subset))
+            assert ratio is not None
+            assert ratio.sums.sum() / ratio.divisors.sum() == pytest.approx(found.value), (subset, name)
     saved = run_benchmark(made(tmp_path), None, tmp_path / "saved").results
     assert saved == results
 
