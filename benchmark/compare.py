@@ -5,7 +5,7 @@ interval is by bootstrap over scenes (``benchmark.bootstrap``).
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,12 +21,23 @@ from benchmark.results import (
     BenchmarkModelResult,
     BenchmarkResults,
     Instances,
-    of_subset,
+    subset_figure,
 )
 from model.arrays import Floats, Ints
 from model.evaluation.tables import UNKNOWN, Table, document, number, signed
 from model.metrics.consistency import RANGES_M
 
+CONTEXT_FIGURES = {
+    subset_figure(heading, subset): subset_figure(measure, subset)
+    for heading, measure in (
+        ("Gain", "gain_m"),
+        ("map advantage", "map_advantage_m"),
+        ("neighbours advantage", "neighbors_advantage_m"),
+        ("compliance", "compliance"),
+    )
+    for subset in (ALL, HARDEST, TURNS)
+}
+"""Measures of the context, by their names in tables."""
 KEY_FIGURES = {
     "ADE-ML 6 s": "ade_ml_6s_m",
     "FDE-ML 6 s": FDE,
@@ -41,16 +52,7 @@ KEY_FIGURES = {
     "D, std": "dispersion_std_m",
     **{f"C({range_m:g} m)": f"convergence_{range_m:g}m_s" for range_m in RANGES_M},
     **{f"FDE, hardest {100 * share:g} %": name for name, share in HARDEST_FDE.items()},
-    **{
-        of_subset(heading, subset): of_subset(measure, subset)
-        for heading, measure in (
-            ("Gain", "gain_m"),
-            ("right map", "map_advantage_m"),
-            ("right neighbours", "neighbors_advantage_m"),
-            ("compliance", "compliance"),
-        )
-        for subset in (ALL, HARDEST, TURNS)
-    },
+    **CONTEXT_FIGURES,
 }
 """Metrics and measures of the context, by their names in tables."""
 CLEAR = 2.0
@@ -92,13 +94,12 @@ class Difference:
 
     @property
     def clear(self) -> bool | None:
-        """True if the difference exceeds two standard errors and its interval excludes 0, as far as these are
-        known; None: unknown."""
-        low, high = self.interval
-        if math.isnan(self.difference) or (math.isnan(self.standard_error) and math.isnan(low)):
+        """True if the difference exceeds two standard errors and its interval, if known, excludes 0; None:
+        unknown."""
+        if math.isnan(self.standard_error) or math.isnan(self.difference):
             return None
-        small = abs(self.difference) <= CLEAR * self.standard_error
-        return not small and not low <= 0 <= high
+        low, high = self.interval
+        return abs(self.difference) > CLEAR * self.standard_error and not low <= 0 <= high
 
 
 @dataclass(frozen=True)
@@ -147,12 +148,14 @@ def compare(a: Path, b: Path) -> Comparison:
     results = (BenchmarkResults.read(a), BenchmarkResults.read(b))
     instances, unpaired = _paired_instances((a, b), results)
     matches = list(_matches(*results))
+    figures, left_out = _compared_figures(*results)
     return Comparison(
         a,
         b,
-        remarks=(*_settings(*results), *_models(matches), *unpaired),
+        remarks=(*_settings(*results), *_models(matches), *unpaired, *left_out),
         models=tuple(
-            ComparedModel(one.key, other.key, _differences(one, other, *instances)) for one, other in matches
+            ComparedModel(one.key, other.key, _differences(one, other, *instances, figures))
+            for one, other in matches
         ),
         only_a=_unmatched(results[0], {one.key for one, _ in matches}),
         only_b=_unmatched(results[1], {other.key for _, other in matches}),
@@ -174,9 +177,9 @@ def table(comparison: Comparison) -> Table:
     rows = tuple(_row(model, one) for model in comparison.models for one in model.differences)
     note = (
         "B − A; in a paired comparison, the mean over the pairs of both runs, with its standard error as if "
-        f"pairs were independent, and its {100 * LEVEL:g} % interval by bootstrap over scenes ({RESAMPLES} "
-        f"resamples, seed {SEED}; none for fewer than two scenes, or if neither run recorded them). Clear: "
-        f"more than {CLEAR:g} standard errors, and an interval without 0."
+        f"pairs were independent. {100 * LEVEL:g} % intervals are by bootstrap over scenes ({RESAMPLES} "
+        f"resamples, seed {SEED}), where both runs hold the figure by scenes; which pairs are the hardest is "
+        f"not drawn again. Clear: more than {CLEAR:g} standard errors, and an interval without 0."
     )
     columns = ("model", "figure", "A", "B", "B − A", "standard error", "95 % interval", "pairs", "clear")
     return Table("Differences", note, columns, rows)
@@ -247,19 +250,41 @@ def _paired_instances(
     if results[0].plan != results[1].plan or results[0].pairs != results[1].pairs:
         return none, ["the runs are of other pairs or plans: no paired comparison"]
     a, b = (Instances.read(folder, one.pairs) for folder, one in zip(folders, results, strict=True))
-    lacking = [run for run, instances in zip("AB", (a, b), strict=True) if not instances.figures]
+    lacking = [
+        run
+        for run, instances in zip("AB", (a, b), strict=True)
+        if not (instances.figures or instances.scene_sums)
+    ]
     if lacking:
         return none, [f"no figures of each pair in {' and '.join(lacking)}: no paired comparison"]
     return (a, b), []
 
 
+def _compared_figures(a: BenchmarkResults, b: BenchmarkResults) -> tuple[Mapping[str, str], list[str]]:
+    """Return the figures that can be compared, and why others cannot."""
+    measured = [one.context_settings for one in (a, b)]
+    if None in measured or measured[0] == measured[1]:
+        return KEY_FIGURES, []
+    settings = " and ".join(
+        f"{one[0]}, {one[1]} donors and seed {one[2]} in {run}"
+        for run, one in zip("AB", measured, strict=True)
+        if one is not None
+    )
+    kept = {heading: name for heading, name in KEY_FIGURES.items() if heading not in CONTEXT_FIGURES}
+    return kept, [f"measures of the context are not compared: by {settings}"]
+
+
 def _differences(
-    one: BenchmarkModelResult, other: BenchmarkModelResult, a: Instances, b: Instances
+    one: BenchmarkModelResult,
+    other: BenchmarkModelResult,
+    a: Instances,
+    b: Instances,
+    figures: Mapping[str, str],
 ) -> tuple[Difference, ...]:
     """Return the differences of all figures that at least one of the models has."""
     scenes = b.scenes if a.scenes is None else a.scenes  # the plans are equal, and so are the scenes
     found = []
-    for figure, name in KEY_FIGURES.items():
+    for figure, name in figures.items():
         was, now = one.figure(name), other.figure(name)
         if math.isnan(was) and math.isnan(now):
             continue

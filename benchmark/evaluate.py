@@ -105,11 +105,11 @@ def evaluate(
             totals.setdefault(key, _Totals(pairs, len(scenes))).add(number, metrics)
         tick(len(scenes[number].pairs))
     each = {f"{key}/{name}": values for key, total in totals.items() for name, values in total.each.items()}
-    of_scenes = {
-        f"{key}/{name}": sums for key, total in totals.items() for name, sums in total.of_scenes.items()
+    scene_sums = {
+        f"{key}/{name}": sums for key, total in totals.items() for name, sums in total.scene_sums.items()
     }
     numbers = np.repeat(np.arange(len(scenes)), [len(scene.pairs) for scene in scenes])
-    instances = Instances(each, numbers, of_scenes)
+    instances = Instances(each, numbers, scene_sums)
     mismatch_m = instances.mismatch_m()
     results = tuple(total.result(models.get(key), mismatch_m) for key, total in totals.items())
     return Evaluated(results, instances, mismatch_m)
@@ -270,7 +270,7 @@ class _Totals:
     lost: int = 0
     times: list[CallTimes] = field(default_factory=list)
     each: dict[str, Floats] = field(default_factory=dict)
-    of_scenes: dict[str, Floats] = field(default_factory=dict)
+    scene_sums: dict[str, Floats] = field(default_factory=dict)
 
     def add(self, number: int, scene: SceneMetrics) -> None:
         """Add the metrics of a scene, by its index."""
@@ -285,7 +285,7 @@ class _Totals:
                 values = self.each.setdefault(name, np.full(self.pairs, np.nan))
                 values[scene.instances] = scene.metrics[name]
         for name, values in scene.instants.items():
-            sums = self.of_scenes.setdefault(name, np.zeros((self.scenes, 2)))
+            sums = self.scene_sums.setdefault(name, np.zeros((self.scenes, 2)))
             known = np.isfinite(values)
             sums[number] = values[known].sum(), known.sum()
 

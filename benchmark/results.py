@@ -44,14 +44,14 @@ TURNS: Final = "turns after now"
 """Subsets of the pairs, over which the use of the context is measured."""
 _SCENES: Final = "scenes"
 """Entry of ``instances.npz``: [pairs], the index of each pair's scene."""
-_OF: Final = " of "
-_OF_SCENES: Final = "of scenes/"
+_SUBSET: Final = ", "
+_SCENE_SUMS: Final = "scene sums/"
 """Beginning of the names of entries of ``instances.npz`` with a row for each scene."""
 
 
-def of_subset(measure: str, subset: str) -> str:
+def subset_figure(measure: str, subset: str) -> str:
     """Return the name of a measure of the context over a subset of the pairs, among a model's figures."""
-    return measure if subset == ALL else f"{measure}{_OF}{subset}"
+    return measure if subset == ALL else f"{measure}{_SUBSET}{subset}"
 
 
 @dataclass(frozen=True)
@@ -141,8 +141,8 @@ class BenchmarkModelResult(ModelResult):
         return self.statuses.get("MISSING", 0) + self.statuses.get("INVALID", 0) + lost
 
     def figure(self, name: str) -> float:
-        """Return a metric, or a measure of the context (see ``of_subset``); NaN where it is unknown."""
-        measure, _, subset = name.partition(_OF)
+        """Return a metric, or a measure of the context (see ``subset_figure``); NaN where it is unknown."""
+        measure, _, subset = name.partition(_SUBSET)
         measured = self.context.get(subset or ALL, {}).get(measure)
         return self.metrics.get(name, math.nan) if measured is None else measured.value
 
@@ -186,6 +186,12 @@ class BenchmarkResults(Results):
         return f"{super().statement()}, seed {self.seed}"
 
     @property
+    def context_settings(self) -> tuple[str, int, int] | None:
+        """What the measures of the context depend on besides the pairs: the model without context, the number
+        of donors and the seed that chooses them; None: they were not measured."""
+        return None if self.context is None else (self.context.no_context, self.context.donors, self.seed)
+
+    @property
     def missing(self) -> int:
         """Number of missing forecasts of all models."""
         return sum(model.missing for model in self.models)
@@ -214,7 +220,7 @@ class Instances:
     """[pairs] by ``<name@version>/<figure>``, NaN where missing; see ``PER_INSTANCE``."""
     scenes: Ints | None = None
     """[pairs], index of each pair's scene; None in files of older versions."""
-    of_scenes: Mapping[str, Floats] = field(default_factory=dict)
+    scene_sums: Mapping[str, Floats] = field(default_factory=dict)
     """[scenes, 2] by ``<name@version>/<figure>``: sum and divisor of a figure over each scene, for figures
     that are no means over pairs (``evaluate.CONSISTENCY``, measures of the context), or that are kept in no
     other form."""
@@ -226,7 +232,7 @@ class Instances:
             model: ``name@version``.
             figure: name of a metric or of a measure of the context.
         """
-        if (sums := self.of_scenes.get(f"{model}/{figure}")) is not None:
+        if (sums := self.scene_sums.get(f"{model}/{figure}")) is not None:
             return Ratio(sums[:, 0], sums[:, 1])
         if self.scenes is None:
             return None
@@ -236,7 +242,7 @@ class Instances:
         return None if values is None else Ratio.of(values, np.ones(len(values)), self.scenes)
 
     def by_scenes(self, models: Sequence[str], figures: Sequence[str]) -> "Instances":
-        """Return these figures over scenes alone, which take a hundredth of the room of those of pairs.
+        """Return these figures over scenes alone, which take much less room than those of pairs.
 
         Args:
             models: ``name@version`` of each.
@@ -256,7 +262,7 @@ class Instances:
     def mismatch_m(self) -> Floats | None:
         """Return the FDE at 6 s of the newest Kalman filter, which ranks the hard cases: [pairs], m; None: it
         was not evaluated."""
-        models = {name.partition("/")[0] for name in self.figures if name.endswith(f"/{FDE}")}
+        models = {name.removesuffix(f"/{FDE}") for name in self.figures if name.endswith(f"/{FDE}")}
         kalman = [model for model in oldest_first(models) if model.partition("@")[0] == KALMAN]
         return self.figures[f"{kalman[-1]}/{FDE}"] if kalman else None
 
@@ -267,7 +273,7 @@ class Instances:
             OSError: the file cannot be written.
         """
         arrays: dict[str, Any] = dict(self.figures)
-        arrays |= {f"{_OF_SCENES}{name}": sums for name, sums in self.of_scenes.items()}
+        arrays |= {f"{_SCENE_SUMS}{name}": sums for name, sums in self.scene_sums.items()}
         if self.scenes is not None:
             arrays[_SCENES] = self.scenes
         with replacing(folder / INSTANCES_FILE) as temporary, temporary.open("wb") as file:
@@ -292,16 +298,19 @@ class Instances:
                 found = {name: arrays[name] for name in arrays.files}
         except (OSError, ValueError, BadZipFile) as error:
             raise BenchmarkError(f"{file}: cannot be read: {error}") from error
-        of_scenes = {
-            name.removeprefix(_OF_SCENES): found.pop(name)
+        scene_sums = {
+            name.removeprefix(_SCENE_SUMS): found.pop(name)
             for name in list(found)
-            if name.startswith(_OF_SCENES)
+            if name.startswith(_SCENE_SUMS)
         }
+        rows = {sums.shape for sums in scene_sums.values()}
+        if len(rows) > 1 or any(len(shape) != 2 or shape[1] != 2 for shape in rows):
+            raise BenchmarkError(f"{file}: figures by scenes are of {sorted(rows)}")
         for name, values in found.items():
             if values.shape != (pairs,):
                 raise BenchmarkError(f"{file}: {name} is of {list(values.shape)}, not of {pairs} pairs")
         scenes = found.pop(_SCENES, None)
-        return cls(found, scenes, of_scenes)
+        return cls(found, scenes, scene_sums)
 
     def _hardest(self, model: str, share: float, scenes: Ints) -> Ratio | None:
         fde_m, mismatch_m = self.figures.get(f"{model}/{FDE}"), self.mismatch_m()

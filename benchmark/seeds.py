@@ -27,6 +27,8 @@ class SeedFigure:
     """One figure of two methods over their trainings."""
 
     figure: str
+    metric: str
+    """Name of the figure among a model's."""
     a: tuple[float, ...]
     """Figure of each training of A."""
     b: tuple[float, ...]
@@ -61,11 +63,13 @@ def compare_seeds(runs: Sequence[Path], a: str, b: str) -> list[SeedFigure]:
         for name in _SETTINGS:
             if getattr(one, name) != getattr(results[0], name):
                 raise BenchmarkError(f"{run}: is of other {name} than {runs[0]}")
-    contexts = {(one.context.no_context, one.context.donors) for one in results if one.context is not None}
-    if len(contexts) > 1:
-        raise BenchmarkError(
-            "the runs measured the context with other models without context, or other donors"
-        )
+    measured = [(run, one.context_settings) for run, one in zip(runs, results, strict=True) if one.context]
+    for run, settings in measured:
+        if settings != measured[0][1]:
+            raise BenchmarkError(
+                f"{run}: measured the context against another model, or with other donors, than "
+                f"{measured[0][0]}"
+            )
     instances = [Instances.read(run, one.pairs) for run, one in zip(runs, results, strict=True)]
     trainings = [_trainings(name, results, instances) for name in (a, b)]
     for name, found in zip((a, b), trainings, strict=True):
@@ -79,10 +83,9 @@ def compare_seeds(runs: Sequence[Path], a: str, b: str) -> list[SeedFigure]:
         interval = (math.nan, math.nan)
         each = [[own.ratio(model.key, metric) for model, own in one] for one in trainings]
         known = [[ratio for ratio in one if ratio is not None] for one in each]
-        divisors = np.array([ratio.divisors for one in known for ratio in one])
-        if list(map(len, known)) == list(map(len, each)) and (divisors == divisors[0]).all():
+        if list(map(len, known)) == list(map(len, each)):
             interval = difference_interval(*known)
-        figures.append(SeedFigure(figure, values[0], values[1], interval))
+        figures.append(SeedFigure(figure, metric, values[0], values[1], interval))
     return figures
 
 
@@ -94,8 +97,17 @@ def table(figures: Sequence[SeedFigure], a: str, b: str) -> Table:
         f"{100 * LEVEL:g} % interval by bootstrap over trainings and scenes ({RESAMPLES} resamples, seed "
         f"{SEED}; {UNKNOWN}: a run does not hold the figure by scenes, or lacks forecasts)."
     )
+    for name, count in zip((a, b), seeds, strict=True):
+        if count == 1:
+            note += f" One training of {name}: how its trainings vary is not included."
     rows = tuple(
-        (one.figure, _spread(one.a), _spread(one.b), signed(one.difference, 3), bounds(one.interval))
+        (
+            one.figure,
+            mean_and_deviation(one.a),
+            mean_and_deviation(one.b),
+            signed(one.difference, 3),
+            bounds(one.interval),
+        )
         for one in figures
     )
     return Table(f"{a} and {b}", note, ("figure", a, b, f"{b} − {a}", "95 % interval"), rows)
@@ -118,6 +130,9 @@ def _trainings(
     return found
 
 
-def _spread(values: Sequence[float]) -> str:
-    deviation = f" ± {number(float(np.std(values, ddof=1)), 3)}" if len(values) > 1 else ""
-    return number(float(np.mean(values)), 3) + deviation
+def mean_and_deviation(values: Sequence[float], digits: int = 3) -> str:
+    """Return a mean ± the standard deviation of several values."""
+    if not values:
+        return UNKNOWN
+    deviation = f" ± {number(float(np.std(values, ddof=1)), digits)}" if len(values) > 1 else ""
+    return number(float(np.mean(values)), digits) + deviation

@@ -193,8 +193,8 @@ def _context(results: BenchmarkResults) -> Table | str:
         f"with those of an agent of another scene (up to {run.donors} a pair) minus FDE with its own. "
         "Control: FDE with its own map, shifted by 0.2 m and turned by 1°, minus FDE; and the mean size of "
         f"that difference. Compliance: 1 − off-road rate on a donor's map / that of {run.no_context}. "
-        f"{run.cases} forecasts of each model; {run.timed} of all took {run.seconds:.0f} s, which are no "
-        "part of the benchmark's time."
+        f"{run.cases} forecasts of each learned model; {run.timed} of all took {run.seconds:.0f} s, which "
+        "are no part of the benchmark's time."
     )
     return Table(title, note, ("model", "pairs of", "pairs", *CONTEXT), rows)
 

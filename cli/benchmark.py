@@ -159,7 +159,7 @@ def compare(
 ) -> None:
     """Show the metrics of two runs side by side.
 
-    Paired differences have 95 % intervals by bootstrap over scenes (2000 resamples, seed 0).
+    Differences have 95 % intervals by bootstrap over scenes (2000 resamples, seed 0).
     """
     from benchmark import BenchmarkError
     from benchmark.compare import compare as compared

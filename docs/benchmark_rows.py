@@ -10,6 +10,7 @@ docs/data/trainings/NAME, without the figures of single pairs, for comparisons w
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -150,15 +151,18 @@ def with_comparison(
         names: names of the two models.
 
     Raises:
-        ValueError: a run is of a part of the pairs, or of another split than train_val.
+        ValueError: a run is of a part of the pairs, or of another split than train_val; or it is one model.
         BenchmarkError: the runs cannot be compared.
     """
+    if names[0] == names[1]:
+        raise ValueError(f"{names[0]} cannot be compared with itself")
     results = [BenchmarkResults.read(run) for run in runs]
     for one in results:
         _check_whole(one.split, one.limit)
     rows = [
         {
             "figure": one.figure,
+            "metric": one.metric,
             names[0]: [round(value, 4) for value in one.a],
             names[1]: [round(value, 4) for value in one.b],
             "interval": [None if math.isnan(bound) else round(bound, 4) for bound in one.interval],
@@ -173,17 +177,25 @@ def keep(run: Path, folder: Path) -> None:
 
     Args:
         run: folder of a benchmark on train_val.
-        folder: where they are kept; created if missing.
+        folder: where they are kept; it must not exist.
 
     Raises:
-        ValueError: the run is of a part of the pairs, or of another split than train_val.
+        ValueError: the run is of a part of the pairs, or of another split than train_val, or lacks a figure
+            by scenes.
+        FileExistsError: the folder exists.
     """
     results = BenchmarkResults.read(run)
     _check_whole(results.split, results.limit)
-    instances = Instances.read(run, results.pairs)
-    folder.mkdir(parents=True, exist_ok=True)
-    results.write(folder)
-    instances.by_scenes([model.key for model in results.models], list(KEY_FIGURES.values())).write(folder)
+    kept = Instances.read(run, results.pairs).by_scenes(
+        [model.key for model in results.models], list(KEY_FIGURES.values())
+    )
+    for model in results.models:
+        for figure in KEY_FIGURES.values():
+            if not math.isnan(model.figure(figure)) and kept.ratio(model.key, figure) is None:
+                raise ValueError(f"{run}: does not hold {figure} of {model.key} by scenes")
+    folder.mkdir(parents=True)
+    replace(results, endpoint="", refusals=()).write(folder)
+    kept.write(folder)
 
 
 def main(
@@ -197,8 +209,9 @@ def main(
 ) -> None:
     """Renew the rows of each file's models in ``docs/data``, or the comparison over trainings."""
     if name is not None:
-        (one,) = results
-        keep(one.parent, TRAININGS / name)
+        if len(results) != 1 or seeds is not None:
+            raise typer.BadParameter("--keep takes one file, and no --seeds")
+        keep(results[0].parent, TRAININGS / name)
         return
     file = BENCHMARK if seeds is None else SEEDS
     data = json.loads(file.read_text(encoding="utf-8"))

@@ -11,11 +11,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import typer
 
-from benchmark.compare import KEY_FIGURES
-from benchmark.seeds import SeedFigure
+from benchmark.seeds import SeedFigure, mean_and_deviation
 from benchmark.seeds import table as seeds_comparison
 from cli.main import app
 from docs import contract_reference
@@ -220,7 +218,10 @@ def consistency_table() -> str:
 
 
 def paper_table(protocol: str) -> str:
-    """Return the models that the paper tabulates: figures of ours at 6 s, with the paper's in brackets."""
+    """Return the models that the paper tabulates: figures of ours at 6 s, with the paper's in brackets.
+
+    Below a model of several trainings, of which one is bundled, stand the means ± standard deviations.
+    """
     rows: dict[str, Row] = {}
     for row in benchmark(f"displacement_{protocol}"):
         if published_figures(row["model"]):
@@ -245,32 +246,29 @@ def paper_table(protocol: str) -> str:
         for heading, column in columns.items()
         if any(column[1](row) is not None for row in rows.values())
     }
-    return table(
-        ["model", *shown],
-        [
-            [model, *(_beside_paper(model, protocol, name, get(row)) for name, get in shown.values())]
-            for model, row in rows.items()
-        ],
-    )
-
-
-def _beside_paper(model: str, protocol: str, metric: str, value: float | None) -> str:
-    """Return our figure, as mean ± standard deviation if there are several trainings, and the paper's."""
-    ours, paper = _two(value), published_figures(model).get(metric)
-    for row in seeds(protocol):
-        if KEY_FIGURES[row["figure"]] == metric and model in row:
-            ours = f"{np.mean(row[model]):.2f} ± {np.std(row[model], ddof=1):.2f}"
-    return ours if paper is None else f"{ours} ({paper:.2f})"
+    lines = []
+    for model, row in rows.items():
+        paper = published_figures(model)
+        figures = [(_two(get(row)), paper.get(name)) for name, get in shown.values()]
+        lines.append(
+            [model, *(ours if theirs is None else f"{ours} ({theirs:.2f})" for ours, theirs in figures)]
+        )
+        trained = {one["metric"]: one[model] for one in seeds(protocol) if model in one}
+        if trained:
+            count = len(next(iter(trained.values())))
+            spread = (mean_and_deviation(trained.get(name, ()), 2) for name, _ in shown.values())
+            lines.append([f"– {count} trainings", *spread])
+    return table(["model", *shown], lines)
 
 
 def seeds_table(protocol: str) -> str:
     """Return the figures of two methods over their trainings, and the differences with their intervals."""
     rows = seeds(protocol)
-    a, b = (name for name in rows[0] if name not in ("figure", "interval"))
+    a, b = (name for name, value in rows[0].items() if name not in ("figure", "metric", "interval"))
     figures = []
     for row in rows:
         low, high = (math.nan if bound is None else bound for bound in row["interval"])
-        figures.append(SeedFigure(row["figure"], tuple(row[a]), tuple(row[b]), (low, high)))
+        figures.append(SeedFigure(row["figure"], row["metric"], tuple(row[a]), tuple(row[b]), (low, high)))
     made = seeds_comparison(figures, a, b)
     return table(made.columns, made.rows)
 

@@ -18,7 +18,7 @@ from benchmark.bootstrap import Ratio, mean_interval
 from benchmark.context.cases import Case, Cases, Change
 from benchmark.errors import BenchmarkError
 from benchmark.plan import PlannedScene
-from benchmark.results import ALL, HARDEST, TURNS, Estimate, of_subset
+from benchmark.results import ALL, HARDEST, TURNS, Estimate, subset_figure
 from cab_forecast import forecasts
 from model.arrays import Bools, Floats, Ints
 from model.data.checks import FUTURE_STEPS, STEPS_AHEAD
@@ -91,7 +91,7 @@ def measure_context(
 def measures_by_scenes(
     figures: ContextFigures, no_context_fde_m: Floats, subsets: Mapping[str, Bools], scenes: Ints
 ) -> dict[str, Ratio]:
-    """Return what the measures of one model are computed of, by ``results.of_subset`` of name and subset.
+    """Return what the measures of one model are computed of, by ``results.subset_figure`` of name and subset.
 
     Args:
         figures: the model's figures of N pairs.
@@ -104,7 +104,7 @@ def measures_by_scenes(
     reference = figures.no_context_off_road
     parts["compliance"] = (reference - figures.off_road, reference)
     return {
-        of_subset(name, subset): Ratio.of(np.where(members, values, np.nan), divisors, scenes)
+        subset_figure(name, subset): Ratio.of(np.where(members, values, np.nan), divisors, scenes)
         for subset, members in subsets.items()
         for name, (values, divisors) in parts.items()
     }

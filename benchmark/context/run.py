@@ -47,7 +47,7 @@ class ContextEvaluated:
     """Number of cases without a forecast, by ``name@version``."""
     each: Mapping[str, Floats]
     """[pairs], m, differences of errors by ``<name@version>/<name>``, NaN where unknown."""
-    of_scenes: Mapping[str, Floats]
+    scene_sums: Mapping[str, Floats]
     """[scenes, 2], sum and divisor of each measure by ``<name@version>/<name>``."""
     refusals: Sequence[Refusal]
     """Calls that the endpoint refused."""
@@ -65,7 +65,7 @@ class ContextEvaluated:
         refusals = (*results.refusals, *map(str, self.refusals))
         held = evaluated.instances
         instances = replace(
-            held, figures={**held.figures, **self.each}, of_scenes={**held.of_scenes, **self.of_scenes}
+            held, figures={**held.figures, **self.each}, scene_sums={**held.scene_sums, **self.scene_sums}
         )
         return (
             replace(results, models=models, context=self.run, refusals=refusals),
@@ -139,7 +139,8 @@ class ContextBenchmark:
             BenchmarkError: the folder holds answers of another run, or the endpoint does not answer.
         """
         with self._bound_archive(address, models) as archive:
-            asked = self.asked(models)
+            if not (asked := self.asked(models)):
+                return Replayed()
             cases = self._unanswered(archive, list(asked), tick)
             replay = Replay(cases, asked, self.protocol, concurrency, patience)
             return _timed(archive, await replay.run(client, archive, tick))
@@ -159,7 +160,8 @@ class ContextBenchmark:
         """
         models = {name: describe(one.info) for name, one in forecasters.items()}
         with self._bound_archive(address, models) as archive:
-            asked = self.asked(models)
+            if not (asked := self.asked(models)):
+                return Replayed()
             cases = self._unanswered(archive, list(asked), tick)
             chosen = {name: forecasters[name] for name in asked}
             return _timed(archive, replay_in_process(cases, chosen, self.protocol, archive, tick))
@@ -181,14 +183,15 @@ class ContextBenchmark:
         evaluation = ContextEvaluation(self.cases, self.scenes, self._paths(folder, reference))
         no_context_fde_m = evaluation.no_context_fde_m()
         subsets = context_subsets(self.scenes, evaluated.mismatch_m)
-        measures, missing, each, of_scenes = {}, {}, {}, {}
+        measures, missing, each, scene_sums = {}, {}, {}, {}
         with Archive(self.folder / FOLDER, read_only=True) as archive:
             archive.check(self._properties())
             for model in models:
                 own = evaluated.instances.figures.get(f"{model}/{FDE}")
                 if own is None:
                     continue
-                if model.partition("@")[0] in BASELINES:
+                asked = model.partition("@")[0] not in BASELINES
+                if not asked:
                     path_of = evaluation.unchanged(self._paths(self.folder, model))
                 else:
                     path_of = evaluation.answers(archive, model)
@@ -196,13 +199,13 @@ class ContextBenchmark:
                 measured = (figures, no_context_fde_m, subsets, evaluation.scene_of)
                 measures[model] = measure_context(*measured)
                 for name, ratio in measures_by_scenes(*measured).items():
-                    of_scenes[f"{model}/{name}"] = np.stack([ratio.sums, ratio.divisors], axis=1)
-                missing[model] = figures.missing
+                    scene_sums[f"{model}/{name}"] = np.stack([ratio.sums, ratio.divisors], axis=1)
+                missing[model] = figures.missing if asked else 0
                 for name, values in figures.differences(no_context_fde_m).items():
                     each[f"{model}/{name}"] = values
             run = ContextRun(reference, self.settings.donors, len(self.cases), *_durations(archive))
             refusals = [one for one in archive.refusals() if one.model in models]
-            return ContextEvaluated(run, measures, missing, each, of_scenes, refusals)
+            return ContextEvaluated(run, measures, missing, each, scene_sums, refusals)
 
     def _paths(self, folder: Path, model: str) -> Floats:
         """Return the most likely trajectories of a model's answers in a benchmark's folder: [N, 12, 2], m."""

@@ -94,14 +94,24 @@ def test_values_that_are_missing_count_for_nothing() -> None:
 def test_the_difference_of_ratios_by_hand() -> None:
     """Sums 3 and 5 over 1 and 3, in two scenes: twice the first, one of each, twice the second."""
     a = Ratio(np.array([3.0, 5.0]), np.array([1.0, 3.0]))
-    b = Ratio(np.zeros(2), np.ones(2))
+    b = Ratio(np.zeros(2), a.divisors)
     assert difference_interval([a], [b]) == pytest.approx((-3.0, -5 / 3))
 
 
 def test_resamples_without_a_divisor_are_left_out() -> None:
-    """Twice the second scene has no ratio of A."""
-    a = Ratio(np.array([3.0, 5.0]), np.array([2.0, 0.0]))
-    b = Ratio(np.zeros(2), np.ones(2))
-    assert difference_interval([a], [b]) == pytest.approx((-4.0, -1.5))
-    nothing = Ratio(np.zeros(2), np.zeros(2))
-    assert np.isnan(difference_interval([nothing], [b])).all()
+    """Of three scenes one has no divisor: three times that one has no ratio."""
+    divisors = np.array([2.0, 1.0, 0.0])
+    a, b = Ratio(np.array([4.0, 1.0, 0.0]), divisors), Ratio(np.zeros(3), divisors)
+    low, high = difference_interval([a], [b])
+    assert (low, high) == (-2.0, -1.0)
+
+
+def test_one_scene_with_a_divisor_tells_no_interval() -> None:
+    divisors = np.array([2.0, 0.0, 0.0])
+    a, b = Ratio(np.array([4.0, 0.0, 0.0]), divisors), Ratio(np.zeros(3), divisors)
+    assert np.isnan(difference_interval([a], [b])).all()
+
+
+def test_figures_of_different_pairs_have_no_interval() -> None:
+    a, b = Ratio(np.ones(3), np.ones(3)), Ratio(np.ones(3), np.array([1.0, 2.0, 1.0]))
+    assert np.isnan(difference_interval([a], [b])).all()

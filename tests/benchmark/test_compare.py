@@ -107,7 +107,39 @@ def test_what_differs_is_said_in_words(tmp_path: Path) -> None:
         "seed: 3 in A, 4 in B",
         "the plans differ (other pairs, calls or data): 0123456789ab in A, fedcba987654 in B",
         "the runs are of other pairs or plans: no paired comparison",
+        "measures of the context are not compared: by trajectron-no-context@1.0.0, 2 donors and seed 3 in A "
+        "and trajectron-no-context@1.0.0, 2 donors and seed 4 in B",
     )
+
+
+def test_measures_of_the_context_by_other_donors_are_not_compared(tmp_path: Path) -> None:
+    a = made_results()
+    assert a.context is not None
+    alike = two(tmp_path, a, a)
+    assert difference(alike, "Gain, turns after now").difference == 0.0
+    (tmp_path / "more").mkdir()
+    other = two(tmp_path / "more", a, replace(a, context=replace(a.context, donors=5)))
+    assert "Gain" not in {one.figure for one in other.models[0].differences}
+    assert other.remarks == (
+        "no figures of each pair in A and B: no paired comparison",
+        "measures of the context are not compared: by trajectron-no-context@1.0.0, 2 donors and seed 3 in A "
+        "and trajectron-no-context@1.0.0, 5 donors and seed 3 in B",
+    )
+
+
+def test_figures_by_scenes_have_an_interval_and_no_standard_error(tmp_path: Path) -> None:
+    """D of 2 m in both of two scenes in A, of 2 and 4 m in B, as a run holds it that is kept by scenes."""
+    key = "cab@1.0.0/dispersion_std_m"
+    runs = []
+    for name, second in (("a", 2.0), ("b", 4.0)):
+        run = saved(tmp_path / name, made_results())
+        Instances({}, None, {key: np.array([[2.0, 1.0], [second, 1.0]])}).write(run)
+        runs.append(run)
+    comparison = compare(*runs)
+    found = difference(comparison, "D, std")
+    assert (found.interval, found.pairs, found.clear) == ((0.0, 2.0), 0, None)
+    assert math.isnan(found.standard_error)
+    assert comparison.remarks == ()
 
 
 def test_pairs_of_another_plan_are_not_compared_one_by_one(tmp_path: Path) -> None:

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from benchmark.bootstrap import Ratio
-from benchmark.results import ALL, TURNS, Estimate, Instances, of_subset
+from benchmark.errors import BenchmarkError
+from benchmark.results import ALL, TURNS, Estimate, Instances, subset_figure
 from tests.benchmark.builders import made_model
 
 PAIRS = 100
@@ -81,9 +82,9 @@ def test_figures_are_written_and_read(tmp_path: Path) -> None:
     assert found.figures.keys() == INSTANCES.figures.keys()
     for name, values in INSTANCES.figures.items():
         np.testing.assert_array_equal(found.figures[name], values)
-    assert found.of_scenes.keys() == INSTANCES.of_scenes.keys()
-    for name, values in INSTANCES.of_scenes.items():
-        np.testing.assert_array_equal(found.of_scenes[name], values)
+    assert found.scene_sums.keys() == INSTANCES.scene_sums.keys()
+    for name, values in INSTANCES.scene_sums.items():
+        np.testing.assert_array_equal(found.scene_sums[name], values)
 
 
 def test_figures_over_scenes_alone_are_the_same(tmp_path: Path) -> None:
@@ -100,6 +101,18 @@ def test_figures_over_scenes_alone_are_the_same(tmp_path: Path) -> None:
 def test_a_figure_is_a_metric_or_a_measure_of_the_context() -> None:
     measures = {ALL: {"gain_m": Estimate(1.25, 0.5, 2.0, 10)}, TURNS: {"gain_m": Estimate(2.5, 1.0, 4.0, 3)}}
     model = replace(made_model("cab"), context=measures)
-    assert (model.figure("gain_m"), model.figure(of_subset("gain_m", TURNS))) == (1.25, 2.5)
+    assert (model.figure("gain_m"), model.figure(subset_figure("gain_m", TURNS))) == (1.25, 2.5)
     assert model.figure("nll") == model.metrics["nll"]
     assert np.isnan(model.figure("compliance"))
+
+
+@pytest.mark.parametrize("shape", [(10,), (10, 3), (9, 2)])
+def test_figures_by_scenes_of_another_form_are_refused(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    sums = {**INSTANCES.scene_sums, "cab@1.0.0/convergence_1m_s": np.ones(shape)}
+    replace(INSTANCES, scene_sums=sums).write(tmp_path)
+    with pytest.raises(BenchmarkError, match="figures by scenes are of"):
+        Instances.read(tmp_path, PAIRS)
+
+
+def test_a_model_with_a_slash_in_its_name_is_no_kalman_filter() -> None:
+    assert Instances({"kalman/x@1.0.0/fde_ml_6s_m": FDE_M}, SCENES).mismatch_m() is None

@@ -98,7 +98,7 @@ def test_the_use_of_the_context_has_a_row_for_each_set_of_pairs() -> None:
         ("cab@1.0.0", "turns after now", "3", "+7.50", "-", "-", "-", "-", "-"),
     )
     assert "FDE of trajectron-no-context@1.0.0 minus" in table.note
-    assert "50 forecasts of each model; 100 of all took 12 s" in table.note
+    assert "50 forecasts of each learned model; 100 of all took 12 s" in table.note
 
 
 def test_pairs_by_status() -> None:

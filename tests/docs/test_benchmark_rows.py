@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmark.results import Instances
+from benchmark.results import PER_INSTANCE, Instances
 from docs import generate
 from docs.benchmark_rows import keep, with_comparison, with_results
 from docs.generate import BENCHMARK
@@ -98,10 +98,18 @@ def trainings(folder: Path, split: str = "train_val") -> list[Path]:
     for seed, (a, b) in enumerate([(8.0, 7.0), (9.0, 7.5)]):
         runs.append(folder / str(seed))
         runs[-1].mkdir()
-        fde = {"trajectron": a, "cab": b}
-        models = [made_model(name, metrics=made_metrics() | {"fde_ml_6s_m": fde[name]}) for name in fde]
+        others = {name: value for name, value in made_metrics().items() if name in PER_INSTANCE}
+        models = [
+            replace(made_model(name, metrics=others | {"fde_ml_6s_m": value}), context={})
+            for name, value in {"trajectron": a, "cab": b}.items()
+        ]
         replace(made_results(*models), split=split, limit=None, pairs=4).write(runs[-1])
-        each = {f"{model.key}/fde_ml_6s_m": np.full(4, fde[model.name]) for model in models}
+        each = {
+            f"{model.key}/{name}": np.full(4, model.metrics[name])
+            for model in models
+            for name in PER_INSTANCE
+            if name in model.metrics
+        }
         Instances(each, np.array([0, 0, 1, 1])).write(runs[-1])
     return runs
 
@@ -114,8 +122,6 @@ def test_two_models_are_compared_over_their_trainings(
     (fde,) = [row for row in rows["causal"] if row["figure"] == "FDE-ML 6 s"]
     assert (fde["trajectron"], fde["cab"]) == ([8.0, 9.0], [7.0, 7.5])
     assert fde["interval"][0] < -1.25 < fde["interval"][1]
-    (dispersion,) = [row for row in rows["causal"] if row["figure"] == "D, std"]
-    assert dispersion["interval"] == [None, None]
     data = tmp_path / "seeds.json"
     data.write_text(json.dumps(rows))
     monkeypatch.setattr(generate, "SEEDS", data)
@@ -125,7 +131,9 @@ def test_two_models_are_compared_over_their_trainings(
     assert line.startswith("| FDE-ML 6 s | 8.500 ± 0.707 | 7.250 ± 0.354 | -1.250 |")
     beside = generate.paper_table("causal").splitlines()
     (line,) = [one for one in beside if one.startswith("| trajectron |")]
-    assert " 8.50 ± 0.71 (10.45) " in line
+    assert " 8.45 (10.45) " in line
+    (line,) = [one for one in beside if one.startswith("| – 2 trainings |") and " 8.50 ± 0.71 " in one]
+    assert line.endswith("| - |")  # they have no figure of the hardest pairs
 
 
 def test_kept_runs_give_the_same_comparison(tmp_path: Path) -> None:
@@ -137,6 +145,14 @@ def test_kept_runs_give_the_same_comparison(tmp_path: Path) -> None:
     names = ("trajectron", "cab")
     assert with_comparison({}, kept, names) == with_comparison({}, runs, names)
     assert with_comparison({}, [kept[0], runs[1]], names) == with_comparison({}, runs, names)
+
+
+def test_a_run_without_figures_by_scenes_is_not_kept(tmp_path: Path) -> None:
+    (run, _) = trainings(tmp_path)
+    (run / "instances.npz").unlink()
+    with pytest.raises(ValueError, match="does not hold ade_ml_6s_m"):
+        keep(run, tmp_path / "kept")
+    assert not (tmp_path / "kept").exists()
 
 
 def test_trainings_on_a_part_of_the_pairs_are_refused(tmp_path: Path) -> None:

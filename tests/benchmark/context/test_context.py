@@ -9,7 +9,7 @@ import pytest
 from benchmark.archive import Archive
 from benchmark.context import ContextSettings
 from benchmark.errors import BenchmarkError
-from benchmark.results import BenchmarkResults, Estimate, Instances, of_subset
+from benchmark.results import BenchmarkResults, Estimate, Instances, subset_figure
 from benchmark.run import Benchmark, run_benchmark
 from model.baselines.kalman import baselines
 from model.forecaster import Forecaster, Protocol
@@ -85,6 +85,15 @@ def test_physics_baselines_are_not_asked_again(tmp_path: Path) -> None:
         assert (found[name].value, found[name].low, found[name].high) == (0, 0, 0), name
 
 
+def test_physics_baselines_alone_are_measured_from_their_own_forecasts(tmp_path: Path) -> None:
+    (kalman,) = baselines()
+    settings = ContextSettings(donors=2, no_context="kalman")
+    results = run_benchmark(made(tmp_path, settings), [kalman], tmp_path).results
+    assert results.context is not None
+    assert results.context.timed == 0
+    assert measures(results, "kalman")["gain_m"].value == 0
+
+
 def test_turns_that_begin_after_now_are_measured_apart(results: BenchmarkResults) -> None:
     turned = [np.ptp(np.unwrap(world.tracks[0].heading)) for world in WORLDS]
     count = sum(angle >= np.deg2rad(30) for angle in turned)
@@ -114,7 +123,7 @@ def test_results_are_written_and_read(tmp_path: Path) -> None:
     held = Instances.read(tmp_path, results.pairs)
     for subset in ("all", "turns after now"):
         for name, found in measures(results, "both", subset).items():
-            ratio = held.ratio("both@1.0.0", of_subset(name, subset))
+            ratio = held.ratio("both@1.0.0", subset_figure(name, subset))
             assert ratio is not None
             assert ratio.sums.sum() / ratio.divisors.sum() == pytest.approx(found.value), (subset, name)
     saved = run_benchmark(made(tmp_path), None, tmp_path / "saved").results
