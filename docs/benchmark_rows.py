@@ -69,6 +69,16 @@ def consistency_row(metrics: Metrics) -> Row:
     }
 
 
+def context_row(measures: Mapping[str, Mapping[str, Mapping[str, float | None]]]) -> Row:
+    """Return value and bounds of the measures of one model's use of the context, by subset and name."""
+    return {
+        subset: {
+            name: [_number(one, bound) for bound in ("value", "low", "high")] for name, one in figures.items()
+        }
+        for subset, figures in measures.items()
+    }
+
+
 def with_results(data: dict[str, list[Row]], results: Mapping[str, Any]) -> dict[str, list[Row]]:
     """Return the data with the rows of a benchmark's models in place of those of the same names.
 
@@ -96,6 +106,10 @@ def with_results(data: dict[str, list[Row]], results: Mapping[str, Any]) -> dict
             )
             if whole:
                 renewed[table][label] = row
+        compared_with = (results.get("context") or {}).get("no_context")
+        known = model.get("context") and compared_with != f"{model['name']}@{model['version']}"
+        if protocol == "causal" and model["protocol"] == protocol and known:
+            renewed["context_causal"][label] = {"model": label, **context_row(model["context"])}
     return {table: list(rows.values()) for table, rows in renewed.items()}
 
 

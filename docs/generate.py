@@ -217,6 +217,34 @@ def consistency_table() -> str:
     )
 
 
+def context_table() -> str:
+    """Return the measures of the use of the context: a row for each model and subset of the pairs."""
+    columns = {
+        "Gain": "gain_m",
+        "map": "map_advantage_m",
+        "neighbours": "neighbors_advantage_m",
+        "control": "map_control_m",
+        "compliance": "compliance",
+    }
+    return table(
+        ["model", "pairs", *columns],
+        [
+            [row["model"], subset, *(_estimate(figures.get(name)) for name in columns.values())]
+            for row in benchmark("context_causal")
+            for subset, figures in row.items()
+            if subset != "model"
+        ],
+    )
+
+
+def _estimate(values: Sequence[float | None] | None) -> str:
+    """Return "value [low, high]"."""
+    if values is None or None in values:
+        return "–"
+    value, low, high = values
+    return f"{value:.2f} [{low:.2f}, {high:.2f}]"
+
+
 def paper_table(protocol: str) -> str:
     """Return the models that the paper tabulates: figures of ours at 6 s, with the paper's in brackets.
 
@@ -329,6 +357,7 @@ PAGES: dict[str, dict[str, Callable[[], str]]] = {
         "displacement_causal": lambda: displacement_table("displacement_causal"),
         "merged_causal": merged_table,
         "consistency_causal": consistency_table,
+        "context_causal": context_table,
         "displacement_paper": lambda: displacement_table("displacement_paper"),
         "beside_paper_causal": lambda: paper_table("causal"),
         "beside_paper_paper": lambda: paper_table("paper"),

@@ -92,6 +92,24 @@ def test_figures_of_other_pairs_are_refused(change: dict[str, Any]) -> None:
         with_results(data(), results(("cab", "9.0.0", "causal"), **change))
 
 
+def test_the_use_of_the_context_is_shown_with_its_intervals(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    estimate = {"value": 1.234, "low": 0.5, "high": 2.0, "pairs": 9}
+    unknown = {"value": None, "low": None, "high": None, "pairs": 0}
+    measured = results(("rubiz", "9.0.0", "causal"), ("made-up", "1.0.0", "causal"))
+    measured["context"] = {"no_context": "made-up@1.0.0"}
+    for model in measured["models"]:
+        model["context"] = {"all": {"gain_m": estimate, "compliance": unknown}}
+    tables = with_results(data(), measured)
+    assert "made-up" not in {one["model"] for one in tables["context_causal"]}
+    assert row(tables, "context_causal", "rubiz")["all"]["gain_m"] == [1.23, 0.5, 2.0]
+    file = tmp_path / "benchmark.json"
+    file.write_text(json.dumps(tables))
+    monkeypatch.setattr(generate, "BENCHMARK", file)
+    assert "| rubiz | all | 1.23 [0.50, 2.00] | – | – | – | – |" in generate.context_table().splitlines()
+
+
 def trainings(folder: Path, split: str = "train_val") -> list[Path]:
     """Two runs, each with a training of two models."""
     runs = []
