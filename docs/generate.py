@@ -349,6 +349,7 @@ PAGES: dict[str, dict[str, Callable[[], str]]] = {
         "methods": contract_reference.methods_table,
         "contract": contract_reference.contract,
     },
+    "experiments.md": {"seeds_causal": lambda: seeds_table("causal")},
     "figures.md": {"scale": scale_table},
     "performance.md": {"peers": lambda: Comparisons.read(PEERS).markdown()},
     "settings.md": {"settings": settings_table},
