@@ -132,7 +132,5 @@ def _trainings(
 
 def mean_and_deviation(values: Sequence[float], digits: int = 3) -> str:
     """Return a mean ± the standard deviation of several values."""
-    if not values:
-        return UNKNOWN
     deviation = f" ± {number(float(np.std(values, ddof=1)), digits)}" if len(values) > 1 else ""
     return number(float(np.mean(values)), digits) + deviation

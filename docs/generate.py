@@ -284,8 +284,10 @@ def paper_table(protocol: str) -> str:
         trained = {one["metric"]: one[model] for one in seeds(protocol) if model in one}
         if trained:
             count = len(next(iter(trained.values())))
-            spread = (mean_and_deviation(trained.get(name, ()), 2) for name, _ in shown.values())
-            lines.append([f"– {count} trainings", *spread])
+            spread = (
+                mean_and_deviation(trained[name], 2) if name in trained else "–" for name, _ in shown.values()
+            )
+            lines.append([f"{model}, {count} trainings", *spread])
     return table(["model", *shown], lines)
 
 
