@@ -187,8 +187,8 @@ class BenchmarkResults(Results):
 
     @property
     def context_settings(self) -> tuple[str, int, int] | None:
-        """What the measures of the context depend on besides the pairs: the model without context, the number
-        of donors and the seed that chooses them; None: they were not measured."""
+        """Model without context, number of donors, and the seed that chooses these: the measures of the context
+        depend on them besides the pairs. None: they were not measured."""
         return None if self.context is None else (self.context.no_context, self.context.donors, self.seed)
 
     @property

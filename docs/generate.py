@@ -294,7 +294,7 @@ def paper_table(protocol: str) -> str:
 def seeds_table(protocol: str) -> str:
     """Return the figures of two methods over their trainings, and the differences with their intervals."""
     rows = seeds(protocol)
-    a, b = (name for name, value in rows[0].items() if name not in ("figure", "metric", "interval"))
+    a, b = (name for name in rows[0] if name not in ("figure", "metric", "interval"))
     figures = []
     for row in rows:
         low, high = (math.nan if bound is None else bound for bound in row["interval"])

@@ -99,7 +99,7 @@ def test_the_difference_of_ratios_by_hand() -> None:
 
 
 def test_resamples_without_a_divisor_are_left_out() -> None:
-    """Of three scenes one has no divisor: three times that one has no ratio."""
+    """A resample of the third scene alone has no ratio."""
     divisors = np.array([2.0, 1.0, 0.0])
     a, b = Ratio(np.array([4.0, 1.0, 0.0]), divisors), Ratio(np.zeros(3), divisors)
     low, high = difference_interval([a], [b])
