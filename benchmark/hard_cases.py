@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmark.plan import HISTORY_FRAMES, PlannedScene
+from benchmark.results import HARDEST_FDE
 from model.arrays import Floats
-from model.metrics.hard import HARD_SHARES, hardest
+from model.metrics.hard import hardest_of_known
 from model.mixture import TrajectoryMixture
 from model.scenes.scene import Raster
 
@@ -59,12 +60,11 @@ def hardest_fde(fde_m: Floats, mismatch_m: Floats) -> dict[str, float]:
         ``fde_hardest_1_m`` … ``fde_hardest_3_m`` and ``fde_hardest_all_m``.
     """
     ranked = np.isfinite(mismatch_m)
-    fde_m, mismatch_m = fde_m[ranked], mismatch_m[ranked]
     figures = {}
-    if len(fde_m):
-        for share in HARD_SHARES:
-            figures[f"fde_hardest_{round(100 * share)}_m"] = _mean(fde_m[hardest(mismatch_m, share)])
-    figures["fde_hardest_all_m"] = _mean(fde_m)
+    if ranked.any():
+        for name, share in HARDEST_FDE.items():
+            figures[name] = _mean(fde_m[hardest_of_known(mismatch_m, share)])
+    figures["fde_hardest_all_m"] = _mean(fde_m[ranked])
     return figures
 
 

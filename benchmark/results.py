@@ -17,7 +17,7 @@ from benchmark.models import KALMAN, oldest_first
 from model.arrays import Floats, Ints
 from model.evaluation.results import RESULTS_FILE, ModelResult, Results, replacing
 from model.forecaster import Protocol
-from model.metrics.hard import HARD_SHARES, hardest
+from model.metrics.hard import HARD_SHARES, hardest_of_known
 
 INSTANCES_FILE: Final = "instances.npz"
 """Figures of each pair, for paired comparisons of two runs."""
@@ -187,8 +187,8 @@ class BenchmarkResults(Results):
 
     @property
     def context_settings(self) -> tuple[str, int, int] | None:
-        """Model without context, number of donors, and the seed that chooses these: the measures of the context
-        depend on them besides the pairs. None: they were not measured."""
+        """Model without context, number of donors, and the seed that chooses these, on which the measures of
+        the context depend; None: they were not measured."""
         return None if self.context is None else (self.context.no_context, self.context.donors, self.seed)
 
     @property
@@ -316,8 +316,7 @@ class Instances:
         fde_m, mismatch_m = self.figures.get(f"{model}/{FDE}"), self.mismatch_m()
         if fde_m is None or mismatch_m is None or not np.isfinite(mismatch_m).any():
             return None
-        members = np.isfinite(mismatch_m)
-        members[members] = hardest(mismatch_m[members], share)
+        members = hardest_of_known(mismatch_m, share)
         return Ratio.of(np.where(members, fde_m, 0.0), members.astype(np.float64), scenes)
 
 

@@ -23,7 +23,7 @@ from cab_forecast import forecasts
 from model.arrays import Bools, Floats, Ints
 from model.data.checks import FUTURE_STEPS, STEPS_AHEAD
 from model.metrics.displacement import displacement_m, fde_m
-from model.metrics.hard import hardest
+from model.metrics.hard import hardest_of_known
 from model.metrics.offroad import off_road
 from model.metrics.path_fan import on_road_path_exists
 from model.metrics.turns import turns_after_now
@@ -118,9 +118,8 @@ def context_subsets(scenes: Sequence[PlannedScene], mismatch_m: Floats | None) -
         mismatch_m: [N], m, FDE of the Kalman filter; None: unknown, without hardest pairs.
     """
     subsets = {ALL: np.ones(sum(len(scene.pairs) for scene in scenes), dtype=np.bool_)}
-    if mismatch_m is not None and (ranked := np.isfinite(mismatch_m)).any():
-        subsets[HARDEST] = ranked.copy()
-        subsets[HARDEST][ranked] = hardest(mismatch_m[ranked], HARD_SHARE)
+    if mismatch_m is not None and np.isfinite(mismatch_m).any():
+        subsets[HARDEST] = hardest_of_known(mismatch_m, HARD_SHARE)
     subsets[TURNS] = np.concatenate([_turns(scene) for scene in scenes])
     return subsets
 

@@ -1,6 +1,6 @@
 """Requests and evaluation of forecasts with a changed context, beside those of a benchmark."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -21,7 +21,7 @@ from benchmark.context.measures import (
 from benchmark.errors import BenchmarkError
 from benchmark.evaluate import Evaluated
 from benchmark.in_process import replay_in_process
-from benchmark.models import BASELINES, describe, is_learned, select
+from benchmark.models import BASELINES, describe, select
 from benchmark.plan import PlannedScene
 from benchmark.replay import Replay, Replayed
 from benchmark.results import FDE, BenchmarkResults, ContextRun, Estimate
@@ -92,9 +92,13 @@ class ContextBenchmark:
         return Cases(self.scenes, self.settings.donors, self.seed)
 
     @staticmethod
-    def asked(models: Mapping[str, Model]) -> dict[str, Model]:
-        """Return the models that are asked; physics baselines are not, since they see no context."""
-        return {key: model for key, model in models.items() if is_learned(model)}
+    def asked(models: Iterable[str]) -> list[str]:
+        """Return the models that are asked; physics baselines are not, since they see no context.
+
+        Args:
+            models: ``name@version`` of the models.
+        """
+        return [key for key in models if key.partition("@")[0] not in BASELINES]
 
     def check(self, models: Sequence[str]) -> None:
         """Refuse to begin without a model to compare with.
@@ -141,8 +145,8 @@ class ContextBenchmark:
         with self._bound_archive(address, models) as archive:
             if not (asked := self.asked(models)):
                 return Replayed()
-            cases = self._unanswered(archive, list(asked), tick)
-            replay = Replay(cases, asked, self.protocol, concurrency, patience)
+            cases = self._unanswered(archive, asked, tick)
+            replay = Replay(cases, {key: models[key] for key in asked}, self.protocol, concurrency, patience)
             return _timed(archive, await replay.run(client, archive, tick))
 
     def replay_in_process(
@@ -162,7 +166,7 @@ class ContextBenchmark:
         with self._bound_archive(address, models) as archive:
             if not (asked := self.asked(models)):
                 return Replayed()
-            cases = self._unanswered(archive, list(asked), tick)
+            cases = self._unanswered(archive, asked, tick)
             chosen = {name: forecasters[name] for name in asked}
             return _timed(archive, replay_in_process(cases, chosen, self.protocol, archive, tick))
 
@@ -184,23 +188,23 @@ class ContextBenchmark:
         no_context_fde_m = evaluation.no_context_fde_m()
         subsets = context_subsets(self.scenes, evaluated.mismatch_m)
         measures, missing, each, scene_sums = {}, {}, {}, {}
+        asked = self.asked(models)
         with Archive(self.folder / FOLDER, read_only=True) as archive:
             archive.check(self._properties())
             for model in models:
                 own = evaluated.instances.figures.get(f"{model}/{FDE}")
                 if own is None:
                     continue
-                asked = model.partition("@")[0] not in BASELINES
-                if not asked:
-                    path_of = evaluation.unchanged(self._paths(self.folder, model))
-                else:
+                if model in asked:
                     path_of = evaluation.answers(archive, model)
+                else:
+                    path_of = evaluation.unchanged(self._paths(self.folder, model))
                 figures = evaluation.figures(path_of, own, tick)
                 measured = (figures, no_context_fde_m, subsets, evaluation.scene_of)
                 measures[model] = measure_context(*measured)
                 for name, ratio in measures_by_scenes(*measured).items():
                     scene_sums[f"{model}/{name}"] = np.stack([ratio.sums, ratio.divisors], axis=1)
-                missing[model] = figures.missing if asked else 0
+                missing[model] = figures.missing if model in asked else 0
                 for name, values in figures.differences(no_context_fde_m).items():
                     each[f"{model}/{name}"] = values
             run = ContextRun(reference, self.settings.donors, len(self.cases), *_durations(archive))

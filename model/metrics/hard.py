@@ -33,3 +33,21 @@ def hardest(mismatch_m: Floats, share: float) -> Bools:
     count = max(1, round(share * len(mismatch_m)))
     marked[np.argsort(-mismatch_m, kind="stable")[:count]] = True
     return marked
+
+
+def hardest_of_known(mismatch_m: Floats, share: float) -> Bools:
+    """Mark the hardest among the instances whose mismatch is finite, as ``hardest`` does.
+
+    Args:
+        mismatch_m: [N], m; others than finite ones are not marked and do not count.
+        share: in (0, 1], of the instances with a finite mismatch.
+
+    Returns:
+        [N], whether an instance is among them.
+
+    Raises:
+        ValueError: the share is outside its bounds.
+    """
+    marked = np.isfinite(mismatch_m)
+    marked[marked] = hardest(mismatch_m[marked], share)
+    return marked

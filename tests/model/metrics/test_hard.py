@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from model.arrays import Floats
-from model.metrics.hard import HARD_SHARES, hardest
+from model.metrics.hard import HARD_SHARES, hardest, hardest_of_known
 
 
 def test_by_hand() -> None:
@@ -33,3 +33,9 @@ def test_what_cannot_be_ranked() -> None:
     for share in (0, -1, 1.5, float("nan")):
         with pytest.raises(ValueError, match="share"):
             hardest(np.ones(3), share)
+
+
+def test_instances_without_a_mismatch_have_no_rank() -> None:
+    mismatch_m = np.array([np.nan, 3.0, np.inf, 9.0, 1.0, 2.0])
+    assert hardest_of_known(mismatch_m, 0.5).tolist() == [False, True, False, True, False, False]
+    assert not hardest_of_known(np.full(3, np.nan), 0.5).any()
