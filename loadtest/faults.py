@@ -30,7 +30,7 @@ from loadtest.traffic import START, Traffic
 
 MODEL = "kalman"
 TIMEOUT = 1.5
-"""Seconds that callers wait for a response."""
+"""Seconds that callers wait for a response, unless said otherwise."""
 _RECOVERY_SECONDS = 10.0
 _RATE = 10.0
 _SCENES, _AGENTS, _STATES = 2, 4, 5
@@ -45,6 +45,8 @@ class Victim:
     server: Server
     models: Path
     record: Path
+    timeout: float = TIMEOUT
+    """Seconds that its callers wait for a response."""
     limits: dict[int, tuple[int, int]] = field(default_factory=dict)
     """Former limits of the process, by resource."""
 
@@ -156,13 +158,13 @@ class Row:
 
 
 @contextmanager
-def victim() -> Iterator[Victim]:
+def victim(timeout: float = TIMEOUT) -> Iterator[Victim]:
     """Run a server with a folder of models and one for recordings."""
     with tempfile.TemporaryDirectory() as folder:
         models, record = Path(folder) / "models", Path(folder) / "record"
         models.mkdir()
         with serving(models, record=record, default_model=MODEL) as server:
-            yield Victim(server, models, record)
+            yield Victim(server, models, record, timeout)
 
 
 async def call_anew(of: Victim) -> list[str]:
@@ -171,7 +173,7 @@ async def call_anew(of: Victim) -> list[str]:
 
     async def rest() -> str:
         try:
-            async with AsyncClient(f"http://{of.server.http}", timeout=TIMEOUT, retries=0) as client:
+            async with AsyncClient(f"http://{of.server.http}", timeout=of.timeout, retries=0) as client:
                 await client.predict(request)
         except ForecastError as error:
             return error.code
@@ -182,7 +184,7 @@ async def call_anew(of: Victim) -> list[str]:
         options = [("grpc.use_local_subchannel_pool", 1)]
         async with grpc.aio.insecure_channel(of.server.grpc, options) as channel:
             try:
-                await PredictionServiceStub(channel).Predict(request, timeout=TIMEOUT)
+                await PredictionServiceStub(channel).Predict(request, timeout=of.timeout)
             except grpc.aio.AioRpcError as error:
                 return error.code().name
         return "OK"
@@ -199,7 +201,7 @@ async def run_row(fault: Fault, of: Victim, seconds: float) -> Row:
         seconds: time for which the fault lasts.
     """
     stop, new = asyncio.Event(), Counter[str]()
-    async with AsyncClient(of.grpc, timeout=TIMEOUT, retries=0) as client, asyncio.TaskGroup() as group:
+    async with AsyncClient(of.grpc, timeout=of.timeout, retries=0) as client, asyncio.TaskGroup() as group:
         await client.list_models()  # the connection is open before the fault
         load = SteadyLoad(client, MODEL, _RATE, _SCENES, _AGENTS)
         await asyncio.to_thread(fault.begin, of)
@@ -225,9 +227,15 @@ async def _recovery(of: Victim, since: float) -> float | None:
     return None
 
 
-def run(seconds: float, faults: Sequence[Fault] = FAULTS) -> list[Row]:
-    """Start a server, and let faults befall it one after the other, each for some seconds."""
-    with victim() as of:
+def run(seconds: float, faults: Sequence[Fault] = FAULTS, timeout: float = TIMEOUT) -> list[Row]:
+    """Start a server, and let faults befall it one after the other.
+
+    Args:
+        seconds: time for which each fault lasts.
+        faults: the faults.
+        timeout: seconds that callers wait for a response.
+    """
+    with victim(timeout) as of:
         return [asyncio.run(run_row(fault, of, seconds)) for fault in faults]
 
 

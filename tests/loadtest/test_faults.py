@@ -7,7 +7,8 @@ from loadtest.faults import FAULTS, Fault, Row, Victim
 
 
 def test_faults_are_seen_as_the_matrix_says_and_pass() -> None:
-    rows = faults.run(1.0, FAULTS[1:3])
+    # The other cores run tests, so an answer may take seconds: its code is what counts here
+    rows = faults.run(1.0, FAULTS[1:3], timeout=5.0)
     assert [row.fault.name for row in rows] == ["out of descriptors", "corrupt checkpoint"]
     assert [problem for row in rows for problem in row.problems()] == []
     assert all(row.kept["OK"] > 3 for row in rows)
