@@ -253,7 +253,7 @@ def _paired_instances(
     lacking = [
         run
         for run, instances in zip("AB", (a, b), strict=True)
-        if not (instances.figures or instances.scene_sums)
+        if not (instances.figures or instances.ratios)
     ]
     if lacking:
         return none, [f"no figures of each pair in {' and '.join(lacking)}: no paired comparison"]

@@ -13,6 +13,7 @@ import torch
 
 from benchmark.answers import CallTimes, SceneAnswers, read_answers
 from benchmark.archive import Archive
+from benchmark.bootstrap import Ratio
 from benchmark.errors import BenchmarkError
 from benchmark.hard_cases import hardest_fde
 from benchmark.models import is_learned, oldest_first, protocol_of
@@ -105,11 +106,9 @@ def evaluate(
             totals.setdefault(key, _Totals(pairs, len(scenes))).add(number, metrics)
         tick(len(scenes[number].pairs))
     each = {f"{key}/{name}": values for key, total in totals.items() for name, values in total.each.items()}
-    scene_sums = {
-        f"{key}/{name}": sums for key, total in totals.items() for name, sums in total.scene_sums.items()
-    }
+    ratios = {f"{key}/{name}": ratio for key, total in totals.items() for name, ratio in total.ratios.items()}
     numbers = np.repeat(np.arange(len(scenes)), [len(scene.pairs) for scene in scenes])
-    instances = Instances(each, numbers, scene_sums)
+    instances = Instances(each, numbers, ratios)
     mismatch_m = instances.mismatch_m()
     results = tuple(total.result(models.get(key), mismatch_m) for key, total in totals.items())
     return Evaluated(results, instances, mismatch_m)
@@ -270,7 +269,7 @@ class _Totals:
     lost: int = 0
     times: list[CallTimes] = field(default_factory=list)
     each: dict[str, Floats] = field(default_factory=dict)
-    scene_sums: dict[str, Floats] = field(default_factory=dict)
+    ratios: dict[str, Ratio] = field(default_factory=dict)
 
     def add(self, number: int, scene: SceneMetrics) -> None:
         """Add the metrics of a scene, by its index."""
@@ -285,9 +284,9 @@ class _Totals:
                 values = self.each.setdefault(name, np.full(self.pairs, np.nan))
                 values[scene.instances] = scene.metrics[name]
         for name, values in scene.instants.items():
-            sums = self.scene_sums.setdefault(name, np.zeros((self.scenes, 2)))
+            ratio = self.ratios.setdefault(name, Ratio(np.zeros(self.scenes), np.zeros(self.scenes)))
             known = np.isfinite(values)
-            sums[number] = values[known].sum(), known.sum()
+            ratio.sums[number], ratio.divisors[number] = values[known].sum(), known.sum()
 
     def result(self, model: Model | None, mismatch_m: Floats | None) -> BenchmarkModelResult:
         """Return the result of a model.

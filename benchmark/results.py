@@ -220,10 +220,9 @@ class Instances:
     """[pairs] by ``<name@version>/<figure>``, NaN where missing; see ``PER_INSTANCE``."""
     scenes: Ints | None = None
     """[pairs], index of each pair's scene; None in files of older versions."""
-    scene_sums: Mapping[str, Floats] = field(default_factory=dict)
-    """[scenes, 2] by ``<name@version>/<figure>``: sum and divisor of a figure over each scene, for figures
-    that are no means over pairs (``evaluate.CONSISTENCY``, measures of the context), or that are kept in no
-    other form."""
+    ratios: Mapping[str, Ratio] = field(default_factory=dict)
+    """Figures as ratios of sums over the scenes by ``<name@version>/<figure>``, for those that are no means
+    over pairs (``evaluate.CONSISTENCY``, measures of the context), or that are kept in no other form."""
 
     def ratio(self, model: str, figure: str) -> Ratio | None:
         """Return a figure as a ratio of sums over the scenes; None: the run does not hold it so.
@@ -232,8 +231,8 @@ class Instances:
             model: ``name@version``.
             figure: name of a metric or of a measure of the context.
         """
-        if (sums := self.scene_sums.get(f"{model}/{figure}")) is not None:
-            return Ratio(sums[:, 0], sums[:, 1])
+        if (ratio := self.ratios.get(f"{model}/{figure}")) is not None:
+            return ratio
         if self.scenes is None:
             return None
         if figure in HARDEST_FDE:
@@ -249,15 +248,7 @@ class Instances:
             figures: names of metrics or of measures of the context.
         """
         ratios = {f"{model}/{figure}": self.ratio(model, figure) for model in models for figure in figures}
-        return Instances(
-            {},
-            None,
-            {
-                name: np.stack([one.sums, one.divisors], axis=1)
-                for name, one in ratios.items()
-                if one is not None
-            },
-        )
+        return Instances({}, None, {name: ratio for name, ratio in ratios.items() if ratio is not None})
 
     def mismatch_m(self) -> Floats | None:
         """Return the FDE at 6 s of the newest Kalman filter, which ranks the hard cases: [pairs], m; None: it
@@ -273,7 +264,10 @@ class Instances:
             OSError: the file cannot be written.
         """
         arrays: dict[str, Any] = dict(self.figures)
-        arrays |= {f"{_SCENE_SUMS}{name}": sums for name, sums in self.scene_sums.items()}
+        arrays |= {
+            f"{_SCENE_SUMS}{name}": np.stack([ratio.sums, ratio.divisors], axis=1)
+            for name, ratio in self.ratios.items()
+        }
         if self.scenes is not None:
             arrays[_SCENES] = self.scenes
         with replacing(folder / INSTANCES_FILE) as temporary, temporary.open("wb") as file:
@@ -310,7 +304,7 @@ class Instances:
             if values.shape != (pairs,):
                 raise BenchmarkError(f"{file}: {name} is of {list(values.shape)}, not of {pairs} pairs")
         scenes = found.pop(_SCENES, None)
-        return cls(found, scenes, scene_sums)
+        return cls(found, scenes, {name: Ratio(*sums.T) for name, sums in scene_sums.items()})
 
     def _hardest(self, model: str, share: float, scenes: Ints) -> Ratio | None:
         fde_m, mismatch_m = self.figures.get(f"{model}/{FDE}"), self.mismatch_m()

@@ -7,9 +7,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-
 from benchmark.archive import Archive, Refusal
+from benchmark.bootstrap import Ratio
 from benchmark.context.cases import Cases, ContextSettings
 from benchmark.context.measures import (
     ContextEvaluation,
@@ -47,8 +46,8 @@ class ContextEvaluated:
     """Number of cases without a forecast, by ``name@version``."""
     each: Mapping[str, Floats]
     """[pairs], m, differences of errors by ``<name@version>/<name>``, NaN where unknown."""
-    scene_sums: Mapping[str, Floats]
-    """[scenes, 2], sum and divisor of each measure by ``<name@version>/<name>``."""
+    ratios: Mapping[str, Ratio]
+    """Each measure as a ratio of sums over the scenes, by ``<name@version>/<name>``."""
     refusals: Sequence[Refusal]
     """Calls that the endpoint refused."""
 
@@ -65,7 +64,7 @@ class ContextEvaluated:
         refusals = (*results.refusals, *map(str, self.refusals))
         held = evaluated.instances
         instances = replace(
-            held, figures={**held.figures, **self.each}, scene_sums={**held.scene_sums, **self.scene_sums}
+            held, figures={**held.figures, **self.each}, ratios={**held.ratios, **self.ratios}
         )
         return (
             replace(results, models=models, context=self.run, refusals=refusals),
@@ -187,7 +186,7 @@ class ContextBenchmark:
         evaluation = ContextEvaluation(self.cases, self.scenes, self._paths(folder, reference))
         no_context_fde_m = evaluation.no_context_fde_m()
         subsets = context_subsets(self.scenes, evaluated.mismatch_m)
-        measures, missing, each, scene_sums = {}, {}, {}, {}
+        measures, missing, each, ratios = {}, {}, {}, {}
         asked = self.asked(models)
         with Archive(self.folder / FOLDER, read_only=True) as archive:
             archive.check(self._properties())
@@ -203,13 +202,13 @@ class ContextBenchmark:
                 measured = (figures, no_context_fde_m, subsets, evaluation.scene_of)
                 measures[model] = measure_context(*measured)
                 for name, ratio in measures_by_scenes(*measured).items():
-                    scene_sums[f"{model}/{name}"] = np.stack([ratio.sums, ratio.divisors], axis=1)
+                    ratios[f"{model}/{name}"] = ratio
                 missing[model] = figures.missing if model in asked else 0
                 for name, values in figures.differences(no_context_fde_m).items():
                     each[f"{model}/{name}"] = values
             run = ContextRun(reference, self.settings.donors, len(self.cases), *_durations(archive))
             refusals = [one for one in archive.refusals() if one.model in models]
-            return ContextEvaluated(run, measures, missing, each, scene_sums, refusals)
+            return ContextEvaluated(run, measures, missing, each, ratios, refusals)
 
     def _paths(self, folder: Path, model: str) -> Floats:
         """Return the most likely trajectories of a model's answers in a benchmark's folder: [N, 12, 2], m."""

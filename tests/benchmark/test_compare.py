@@ -8,6 +8,7 @@ from types import MappingProxyType
 import numpy as np
 import pytest
 
+from benchmark.bootstrap import Ratio
 from benchmark.compare import Comparison, Difference, compare, markdown, table
 from benchmark.errors import BenchmarkError
 from benchmark.results import INSTANCES_FILE, BenchmarkResults, Instances
@@ -133,7 +134,7 @@ def test_figures_by_scenes_have_an_interval_and_no_standard_error(tmp_path: Path
     runs = []
     for name, second in (("a", 2.0), ("b", 4.0)):
         run = saved(tmp_path / name, made_results())
-        Instances({}, None, {key: np.array([[2.0, 1.0], [second, 1.0]])}).write(run)
+        Instances({}, None, {key: Ratio(np.array([2.0, second]), np.ones(2))}).write(run)
         runs.append(run)
     comparison = compare(*runs)
     found = difference(comparison, "D, std")

@@ -2,13 +2,14 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from benchmark.bootstrap import Ratio
 from benchmark.errors import BenchmarkError
-from benchmark.results import ALL, TURNS, Estimate, Instances, subset_figure
+from benchmark.results import ALL, INSTANCES_FILE, TURNS, Estimate, Instances, subset_figure
 from tests.benchmark.builders import made_model
 
 PAIRS = 100
@@ -23,7 +24,7 @@ INSTANCES = Instances(
         "kalman@1.10.0/fde_ml_6s_m": MISMATCH_M,
     },
     SCENES,
-    {"cab@1.0.0/dispersion_std_m": np.stack([np.arange(10.0), np.full(10, 2.0)], axis=1)},
+    {"cab@1.0.0/dispersion_std_m": Ratio(np.arange(10.0), np.full(10, 2.0))},
 )
 
 
@@ -82,9 +83,10 @@ def test_figures_are_written_and_read(tmp_path: Path) -> None:
     assert found.figures.keys() == INSTANCES.figures.keys()
     for name, values in INSTANCES.figures.items():
         np.testing.assert_array_equal(found.figures[name], values)
-    assert found.scene_sums.keys() == INSTANCES.scene_sums.keys()
-    for name, values in INSTANCES.scene_sums.items():
-        np.testing.assert_array_equal(found.scene_sums[name], values)
+    assert found.ratios.keys() == INSTANCES.ratios.keys()
+    for name, ratio in INSTANCES.ratios.items():
+        np.testing.assert_array_equal(found.ratios[name].sums, ratio.sums)
+        np.testing.assert_array_equal(found.ratios[name].divisors, ratio.divisors)
 
 
 def test_figures_over_scenes_alone_are_the_same(tmp_path: Path) -> None:
@@ -108,8 +110,12 @@ def test_a_figure_is_a_metric_or_a_measure_of_the_context() -> None:
 
 @pytest.mark.parametrize("shape", [(10,), (10, 3), (9, 2)])
 def test_figures_by_scenes_of_another_form_are_refused(tmp_path: Path, shape: tuple[int, ...]) -> None:
-    sums = {**INSTANCES.scene_sums, "cab@1.0.0/convergence_1m_s": np.ones(shape)}
-    replace(INSTANCES, scene_sums=sums).write(tmp_path)
+    INSTANCES.write(tmp_path)
+    file = tmp_path / INSTANCES_FILE
+    with np.load(file) as arrays:
+        held: dict[str, Any] = dict(arrays)
+    held["scene sums/cab@1.0.0/convergence_1m_s"] = np.ones(shape)
+    np.savez(file, **held)
     with pytest.raises(BenchmarkError, match="figures by scenes are of"):
         Instances.read(tmp_path, PAIRS)
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmark.bootstrap import Ratio
 from benchmark.errors import BenchmarkError
 from benchmark.results import BenchmarkResults, ContextRun, Instances
 from benchmark.seeds import compare_seeds, table
@@ -56,12 +57,12 @@ def test_figures_of_scenes_have_intervals(tmp_path: Path) -> None:
         run = saved(tmp_path / str(seed), {"trajectron": 8.0, "cab": 8.0 - scale})
         held = Instances.read(run, PAIRS)
         mismatch_m = np.where(SCENES == 9, 60.0, 1.0) + np.arange(float(PAIRS))
-        sums = {
-            f"{model.key}/dispersion_std_m": np.full((10, 2), (2 * size, 2.0))
+        ratios = {
+            f"{model.key}/dispersion_std_m": Ratio(np.full(10, 2 * size), np.full(10, 2.0))
             for model, size in zip(BenchmarkResults.read(run).models, (scale, 2 * scale), strict=True)
         }
         figures = {**held.figures, f"kalman@1.0.0/{FDE}": mismatch_m}
-        replace(held, figures=figures, scene_sums=sums).write(run)
+        replace(held, figures=figures, ratios=ratios).write(run)
         runs.append(run)
     found = {one.figure: one for one in compare_seeds(runs, "trajectron", "cab")}
     wider = math.sqrt(2)
