@@ -11,7 +11,7 @@ import httpx
 import yaml
 
 from tests.deploy.files import PROMETHEUS, read_yaml
-from tests.system.fleet import free_port
+from tests.system.fleet import free_port, until
 from tests.system.programs import program
 
 Change = Callable[[str], str]
@@ -29,6 +29,10 @@ class Prometheus:
         """
         self._address = address
         self._targets = targets
+
+    def ready(self) -> bool:
+        """Return whether it answers queries: not while it reads its storage."""
+        return httpx.get(f"http://{self._address}/-/ready").is_success
 
     def ask(self, query: str) -> list[Any]:
         """Return the series of a query."""
@@ -55,7 +59,7 @@ class Prometheus:
 async def prometheus(
     folder: Path, token: str, servers: Sequence[str], balancer: str | None = None, change: Change = str
 ) -> AsyncIterator[Prometheus]:
-    """Run Prometheus.
+    """Run Prometheus; it is ready.
 
     Args:
         folder: for files.
@@ -87,7 +91,9 @@ async def prometheus(
     address = f"127.0.0.1:{free_port()}"
     arguments = ["--config.file", str(folder / "prometheus.yml"), "--web.listen-address", address]
     with program("prometheus", *arguments, "--storage.tsdb.path", str(folder / "data")):
-        yield Prometheus(address, targets)
+        made = Prometheus(address, targets)
+        await until(made.ready, "Prometheus is ready")
+        yield made
 
 
 def write_targets(file: Path, servers: Sequence[str]) -> None:
