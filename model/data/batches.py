@@ -10,9 +10,9 @@ from model.arrays import Bools
 from model.data.augmentation import rotate
 from model.data.cache import Cache
 from model.data.cache_layout import draws, in_agent_frame, neighbors_name
-from model.data.packing import unpack_patches
-from model.data.patches import PatchCutter
+from model.data.patches import PatchCutter, agent_frame_patches
 from model.data.scenes import DataError
+from model.features.agent_features import PATCHES
 from model.forecaster import Features
 from model.geometry import rotate as rotate_vectors
 from model.networks.config import AnyNetworkConfig
@@ -35,8 +35,9 @@ class Batches:
             device: device of the batches; a GPU gets a copy of the whole cache, except for map patches of the
                 agents' frames.
             config: configuration of a network that may see less than the cache holds; None: everything.
-            packed_maps: leave map patches of the agent's frame packed, three layers a byte. Perturbations
-                then move a twelfth of the memory, and the caller has to call ``packing.unpack_patches``.
+            packed_maps: show map patches of the agent's frame as the cache holds them: rounded, and packed,
+                three layers a byte. Perturbations then move a twelfth of the memory, and the caller has to
+                call ``packing.unpack_patches``. False: cut them from the rasters, as serving does.
 
         Raises:
             DataError: the cache does not hold the features of the network.
@@ -53,20 +54,30 @@ class Batches:
             held = "the agents' own frames" if key.agent_frame else "the ground frame"
             raise DataError(f"the cache holds features in {held}, which this network does not take")
         self.variants = key.variants
-        self._keeps_packed = packed_maps
         arrays = {
             "origin": cache.position,
             "velocity": cache.velocity,
             "history": cache.history,
             "first": cache.first,
         }
+        self._cache = cache
         self._packed: dict[str, Tensor] = {}
+        self._patches: list[str] = []
         if key.agent_frame:
             arrays |= {"heading": cache.heading, "speed": cache.speed}
             del arrays["velocity"]
             if wanted:
                 arrays["neighbors"] = cache.agents
-            self._packed = _packed_patches(cache, config)
+            sees = {"map": config is None or config.uses_map, "far_map": config is None or config.far_map}
+            if packed_maps:
+                packed = {"map": cache.near_patch, "far_map": cache.far_patch}
+                self._packed = {
+                    name: torch.from_numpy(patches)
+                    for name, patches in packed.items()
+                    if sees[name] and patches is not None
+                }
+            else:
+                self._patches = [name for name in PATCHES if sees[name]]
         elif wanted and cache.neighbor_boxes is not None:
             arrays["neighbor_boxes"] = cache.neighbor_boxes
         elif wanted:
@@ -135,8 +146,10 @@ class Batches:
             features["map"] = self._cut(indices)
         for name, packed in self._packed.items():
             # The file is read on demand, so indexing is on the CPU
-            here = packed[indices.cpu()].to(self._device)
-            features[name] = here if self._keeps_packed else unpack_patches(here)
+            features[name] = packed[indices.cpu()].to(self._device)
+        if self._patches:
+            patches = agent_frame_patches(self._cache, indices.cpu().numpy(), self._patches)
+            features |= {name: each.to(self._device) for name, each in patches.items()}
         return features, self._future.index_select(0, indices)
 
 
@@ -160,14 +173,6 @@ def _leaving(cache: Cache) -> Bools:
     farthest = np.nanmax(np.hypot(before[..., 0], before[..., 1]), axis=1)
     stood = (cache.first[rows] < before.shape[1] - 1) & (farthest < STOOD_M)
     return np.asarray(stood & (np.hypot(end[:, 0], end[:, 1]) > LEFT_M))
-
-
-def _packed_patches(cache: Cache, config: AnyNetworkConfig | None) -> dict[str, Tensor]:
-    """Return the packed map patches that a network of the agent's frame uses, by feature."""
-    near = config is None or config.uses_map
-    far = config is None or config.far_map
-    arrays = {"map": cache.near_patch if near else None, "far_map": cache.far_patch if far else None}
-    return {name: torch.from_numpy(array) for name, array in arrays.items() if array is not None}
 
 
 class JoinedPairs:

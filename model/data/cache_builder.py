@@ -34,13 +34,13 @@ from model.data.packing import pack, pack_patches
 from model.data.protocols import SceneFrames
 from model.data.scenes import DataError, Reader, SceneRecord
 from model.data.sensing import SensedFrames
-from model.features.agent_features import agent_frame_features
+from model.features.agent_features import OUTSIDE, PATCHES, agent_frame_features
 from model.features.scene_features import network_features
 from model.features.spec import Frame
 from model.forecaster import Context, Protocol
 from model.geometry import wrap_angle
 from model.networks.config import AnyNetworkConfig, NetworkConfig
-from model.scenes.raster import FAR, NEAR, cut_patches
+from model.scenes.raster import cut_patches
 from model.scenes.scene import AgentType, Raster
 
 _FIRST_MESSAGE, _MESSAGES = 5.0, 15.0
@@ -230,8 +230,9 @@ def _agent_frame_arrays(
             for name in reports[0]
         }
         part["position"], part["agents"] = part.pop("origin"), part.pop("neighbors")
-        for name, geometry in (("near_patch", NEAR), ("far_patch", FAR)):
-            patches = cut_patches(record.raster, part["position"], part["heading"], geometry, outside=0.5)
+        for name, feature in (("near_patch", "map"), ("far_patch", "far_map")):
+            geometry = PATCHES[feature]
+            patches = cut_patches(record.raster, part["position"], part["heading"], geometry, OUTSIDE)
             part[name] = pack_patches(patches)
         parts.append(part)
     arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

@@ -1,7 +1,9 @@
-"""Map patches of agents in many scenes, cut from packed rasters on any device.
+"""Map patches of agents in many scenes, cut from the rasters of a cache.
 
-The patches equal those of ``model.scenes.raster.cut_patches``; here all agents of a batch share one look-up.
+The patches equal those of ``model.scenes.raster.cut_patches``, by which serving cuts them.
 """
+
+from collections.abc import Collection
 
 import numpy as np
 import torch
@@ -10,7 +12,14 @@ from torch import Tensor
 from model.arrays import Floats, Ints
 from model.data.cache import Cache
 from model.data.packing import LAYERS
-from model.scenes.raster import COLUMNS_RIGHT, PATCH_PIXELS_PER_METER, PATCH_SIZE, ROWS_BEHIND
+from model.features.agent_features import OUTSIDE, PATCHES
+from model.scenes.raster import (
+    COLUMNS_RIGHT,
+    PATCH_PIXELS_PER_METER,
+    PATCH_SIZE,
+    ROWS_BEHIND,
+    cut_patches,
+)
 
 _CHUNK = {"cpu": 8}
 """Agents at once, by type of device; so few fit into a CPU's cache."""
@@ -19,8 +28,36 @@ _FAR = 1e4
 """Pixels; agents farther outside their raster are treated as this far outside, as they see nothing of it."""
 
 
+def agent_frame_patches(cache: Cache, rows: Ints, names: Collection[str]) -> dict[str, Tensor]:
+    """Return the map patches that a network of the agent's frame is shown in serving.
+
+    The cache's own ``near_patch`` and ``far_patch`` are these, rounded.
+
+    Args:
+        cache: cache with rasters and poses.
+        rows: [n], rows of the cache; it is fastest if they are of few scenes.
+        names: names of their features, of ``PATCHES``.
+
+    Returns:
+        [n, 3, S, S] float32 in [-1, 1] by name: absent −1, present 1, bilinear between, 0 unknown. They are
+        on the CPU, channels last, which is fastest for convolutions.
+    """
+    form = (len(rows), LAYERS, PATCH_SIZE, PATCH_SIZE)
+    made = {name: torch.empty(form, memory_format=torch.channels_last) for name in names}
+    scenes = cache.scene[rows]
+    for scene in np.unique(scenes).tolist():
+        here = np.flatnonzero(scenes == scene)
+        raster = cache.raster(scene)
+        position, heading = cache.position[rows[here]], cache.heading[rows[here]]
+        for name in names:
+            patches = cut_patches(raster, position, heading, PATCHES[name], OUTSIDE)
+            made[name][here] = torch.from_numpy(patches).mul_(2).sub_(1)
+    return made
+
+
 class PatchCutter:
-    """Cutter of the map patches of a cache's pairs."""
+    """Cutter of the map patches of a cache's pairs in the ground frame, on any device; all agents of a batch
+    share one look-up."""
 
     def __init__(self, cache: Cache, device: torch.device) -> None:
         """

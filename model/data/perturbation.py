@@ -17,9 +17,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from model.data.packing import UNKNOWN, without_layer
-from model.features.agent_features import NEIGHBOR_POSITION_SCALE, NEIGHBOR_REACH_M
+from model.features.agent_features import NEIGHBOR_POSITION_SCALE, NEIGHBOR_REACH_M, PATCHES
 from model.forecaster import Features
-from model.scenes.raster import FAR, NEAR, PatchGeometry
+from model.scenes.raster import PatchGeometry
 
 HISTORY_NOISE: Final = (0.0015, 0.006, 0.007, 0.02, 0.07, 0.07, 0.02, 0.04)
 """Maximum standard deviations of the noise on a history, in its scales: 3 cm, 0.1 m/s, 0.2 to 0.35 m/s²,
@@ -53,8 +53,6 @@ GAP_M: Final = (6.0, 40.0)
 LATERAL_OFFSET_M: Final = 0.5
 """m, standard deviation of the stopped vehicle's place across that direction."""
 
-_MAPS: Final = {"map": NEAR, "far_map": FAR}
-
 
 def jitter(features: Features, future: Tensor) -> tuple[Features, Tensor]:
     """Return jittered features and futures.
@@ -84,7 +82,7 @@ def jitter(features: Features, future: Tensor) -> tuple[Features, Tensor]:
     jittered["history"] = history + noise * observed[..., None]
     turn = MAX_TURN_RAD * (2 * torch.rand(size, device=history.device) - 1)
     shift = MAX_SHIFT_M * (2 * torch.rand(size, 2, device=history.device) - 1)
-    for name, geometry in _MAPS.items():
+    for name, geometry in PATCHES.items():
         if name in features:
             patches = features[name]
             patches[chosen] = moved(patches[chosen], turn, shift, stretch, geometry)
@@ -178,7 +176,7 @@ def drop_dividers(features: Features) -> Features:
         features: as for ``drop_context``.
     """
     dropped = dict(features)
-    for name in _MAPS.keys() & features.keys():
+    for name in PATCHES.keys() & features.keys():
         patches = features[name].clone()
         for layer in (1, 2):
             rows = (torch.rand(len(patches), device=patches.device) < NO_DIVIDERS).nonzero()[:, 0]

@@ -1,6 +1,7 @@
 """The tensors that a network of the agent's frame takes of a scene."""
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 import torch
@@ -25,6 +26,10 @@ NEIGHBOR_ACCELERATION_SCALE = 4.0
 NEIGHBOR_FEATURES = 11
 """Numbers of a neighbour: x, y, cosine and sine of its heading (zeros where unknown), vx, vy, ax, ay, all in
 the agent's frame, 1 for a vehicle, 1 for a pedestrian, and 1 for presence (0 where there is no neighbour)."""
+PATCHES: Final = {"map": NEAR, "far_map": FAR}
+"""Geometry of the map patches, by the name of the feature."""
+OUTSIDE: Final = 0.5
+"""Value of a patch's pixels outside the raster, in [0, 1]: unknown."""
 _NEIGHBOR_KINDS = (AgentType.VEHICLE, AgentType.PEDESTRIAN)
 
 
@@ -62,9 +67,9 @@ def agent_frame_view(scene: Scene, targets: Ints, spec: FeatureSpec, context: Co
         if spec.neighbor_types:
             features["neighbors"] = _neighbors(scene, targets, spec.neighbor_types).astype(np.float32)
         if spec.uses_map:
-            views["map"] = map_view(scene, targets, scene.patches, NEAR, outside=0.5)
+            views["map"] = map_view(scene, targets, scene.patches, PATCHES["map"], OUTSIDE)
         if spec.far_map:
-            views["far_map"] = map_view(scene, targets, scene.far_patches, FAR, outside=0.5)
+            views["far_map"] = map_view(scene, targets, scene.far_patches, PATCHES["far_map"], OUTSIDE)
     tensors = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in features.items()}
     return Prepared(tensors, views)
 

@@ -28,13 +28,15 @@ from cab_forecast import AsyncClient
 from cab_forecast.explanations import PARTS
 from model.evaluation import selection
 from model.evaluation.run import Evaluation
+from model.features.spec import Frame
 from model.forecaster import Forecaster, Protocol
 from model.metrics.density import DRAWS
 from model.metrics.oracle import ORACLE, PHYSICS
 from model.metrics.pairs import Sampling
+from model.networks.config import NetworkConfig
 from service.server import Server
 from tests.benchmark.scenes import PAIRS, READER
-from tests.model.evaluation.builders import checkpoints
+from tests.model.evaluation.builders import checkpoints, save
 from tests.service.servers import in_thread, settings
 
 SAMPLES = 20
@@ -42,8 +44,10 @@ SAMPLES = 20
 
 @pytest.fixture(scope="module")
 def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Checkpoints of random weights."""
-    return checkpoints(tmp_path_factory.mktemp("models"))
+    """Checkpoints of random weights, in both frames."""
+    folder = checkpoints(tmp_path_factory.mktemp("models"))
+    save(folder / "trajectron", "trajectron", NetworkConfig(frame=Frame.AGENT, far_map=True, modes=3))
+    return folder
 
 
 @pytest.fixture(scope="module")
