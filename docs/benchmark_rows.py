@@ -23,7 +23,7 @@ from benchmark.seeds import compare_seeds
 from docs.generate import BENCHMARK, DOCS, SEEDS, Row
 
 TRAININGS = DOCS / "data/trainings"
-"""Runs of trainings whose checkpoints are not bundled."""
+"""Runs of trainings, most of whose checkpoints are not bundled."""
 Metrics = Mapping[str, float | None]
 
 
