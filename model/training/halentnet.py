@@ -27,6 +27,8 @@ from model.training.processes import average_gradients
 
 STEPS = 12
 DISCRIMINATOR_RATE = 2e-4
+"""Learning rate of the discriminator; in the agent's frame it warms up and cools down as the generator's. At a
+constant rate it got ahead of a generator that cools down, and drove it off its paths (docs/experiments.md)."""
 BETAS = (0.5, 0.999)
 """β of the discriminator's Adam."""
 MAP_RATE_FACTOR = 0.4
@@ -146,6 +148,7 @@ class HalentLearner(Learner):
         super().__init__(self._learner.networks)
         self._adversarial_size = min(config.adversarial_batch_size, config.batch_size)
         self._modes = config.network.modes
+        self._full_rate = config.learning_rate if config.in_agent_frame else None
         dtype = config.precision.dtype_on(device)
         self.discriminator = Discriminator(STEPS, self._modes, dtype).to(device)
         self.discriminator_optimizer = torch.optim.Adam(
@@ -166,6 +169,9 @@ class HalentLearner(Learner):
 
     def step(self, batches: Sequence[Batch], weights: LossWeights, rate: float) -> dict[str, Tensor]:
         for_discriminator, for_generator, for_cvae = batches
+        if self._full_rate is not None:
+            for group in self.discriminator_optimizer.param_groups:
+                group["lr"] = DISCRIMINATOR_RATE * rate / self._full_rate
         terms = self.train_discriminator(for_discriminator, weights)
         terms |= self.train_generator(for_generator, weights, rate)
         return terms | self._learner.step([for_cvae], weights, rate)
