@@ -114,6 +114,15 @@ def test_in_the_agents_frame_one_step_teaches_both_networks() -> None:
     assert not any(same(module, before[name]) for name, module in learner.modules().items())
 
 
+def test_in_the_agents_frame_the_discriminator_cools_down_with_the_generator() -> None:
+    learner, batch = in_the_agents_frame()
+    full = small_config(Method.HALENTNET).learning_rate
+    for share in (1.0, 0.1):
+        learner.step([batch, batch, batch], WEIGHTS, share * full)
+        (group,) = learner.discriminator_optimizer.param_groups
+        assert group["lr"] == pytest.approx(share * 2e-4)
+
+
 def test_in_the_agents_frame_a_hallucination_drives_by_the_controls_of_two_modes() -> None:
     learner, batch = in_the_agents_frame()
     learner.networks.eval()
