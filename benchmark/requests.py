@@ -1,5 +1,7 @@
 """Requests from recorded scenes, as a driving stack would send them."""
 
+import math
+
 import numpy as np
 
 from benchmark.plan import Call, PlannedScene
@@ -9,6 +11,7 @@ from model.arrays import Floats
 from model.data.protocols import SceneFrames
 from model.forecaster import Protocol
 from model.scenes.observations import Observations
+from model.scenes.raster import FAR, NEAR, coarsening
 from model.scenes.scene import STEP_SECONDS, Raster
 
 REACH_M = 74.0
@@ -71,7 +74,7 @@ class SceneRequests:
 
 
 def crop(raster: Raster, around: Floats) -> Raster:
-    """Return the part of a map that some agents can see, on the same pixel grid.
+    """Return the part of a map that some agents can see, of which their patches are those of the whole map.
 
     Off the map this is one empty pixel: beyond the edge of a map nothing is driveable, while without a map
     models would treat it as unknown.
@@ -83,6 +86,7 @@ def crop(raster: Raster, around: Floats) -> Raster:
     scale = raster.pixels_per_meter
     size = np.array(raster.layers.shape[1:])
     low = np.floor((around.min(axis=0) - REACH_M - raster.origin) * scale).clip(0, size).astype(int)
+    low -= low % math.lcm(*(coarsening(scale, geometry) for geometry in (NEAR, FAR)))
     high = np.ceil((around.max(axis=0) + REACH_M - raster.origin) * scale).clip(0, size).astype(int)
     part = raster.layers[:, low[0] : high[0], low[1] : high[1]]
     if not part.size:

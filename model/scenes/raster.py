@@ -247,6 +247,19 @@ def cut_patches(
     return patches.clip(0, 1, out=patches)  # rounding
 
 
+def coarsening(pixels_per_meter: float, geometry: PatchGeometry) -> int:
+    """Return the side of the coarse pixels, in pixels of a raster, from which patches of it are cut.
+
+    They are counted from the raster's corner: a part of a raster gives the same patches as the whole if it
+    begins at a multiple of this.
+
+    Args:
+        pixels_per_meter: resolution of the raster.
+        geometry: geometry of the patches.
+    """
+    return max(int(pixels_per_meter / geometry.pixels_per_meter), 1)
+
+
 def _raster_view(
     raster: Raster, position: Floats, heading: Floats, geometry: PatchGeometry, outside: float
 ) -> MapView:
@@ -257,7 +270,7 @@ def _raster_view(
     # In raster pixels from here on; (row, column) correspond to ground (x, y)
     center = (position - raster.origin) * raster.pixels_per_meter
     zoom = raster.pixels_per_meter / geometry.pixels_per_meter
-    factor = max(int(zoom), 1)
+    factor = coarsening(raster.pixels_per_meter, geometry)
     reach = geometry.reach * zoom + 1
     on_map: Bools = np.all((center > -reach) & (center < size - 1 + reach), axis=1)
     if on_map.any() and raster.layers.size:

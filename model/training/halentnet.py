@@ -27,9 +27,8 @@ from model.training.processes import average_gradients
 
 STEPS = 12
 DISCRIMINATOR_RATE = 2e-4
-"""Learning rate of the discriminator. In the agent's frame it warms up and cools down as the generator's does:
-a discriminator that goes on learning gets ahead of a generator that cools down, and drives it off its paths
-(docs/experiments.md)."""
+"""Learning rate of the discriminator. In the agent's frame it warms up and cools down with the generator.
+Otherwise it gets ahead of a generator that cools down, and drives it off its paths (docs/experiments.md)."""
 BETAS = (0.5, 0.999)
 """β of the discriminator's Adam."""
 MAP_RATE_FACTOR = 0.4

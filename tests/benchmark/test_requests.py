@@ -14,6 +14,7 @@ from model.data.protocols import SceneFrames
 from model.features.scene_features import ground_frame_features
 from model.forecaster import Context, Protocol
 from model.networks.config import NetworkConfig
+from model.scenes.raster import FAR, NEAR, PatchGeometry, cut_patches
 from model.scenes.resample import resample
 from model.scenes.scene import AgentStates, AgentType, Raster, Scene
 from service.predict.request import read_agents
@@ -99,6 +100,24 @@ def test_the_part_of_the_map_that_is_sent_shows_the_same() -> None:
     layers = decode_layers(part.image, part.rows, part.columns).astype(np.uint8)
     cut = Raster(layers, np.array([part.origin_x, part.origin_y]), part.pixels_per_meter)
     np.testing.assert_allclose(patches(cut), patches(whole), atol=1e-6)
+
+
+@pytest.mark.parametrize("pixels_per_meter", [3.0, 10.0])
+@pytest.mark.parametrize("geometry", [NEAR, FAR])
+def test_coarse_pixels_of_the_part_are_those_of_the_map(
+    pixels_per_meter: float, geometry: PatchGeometry
+) -> None:
+    """Patches of a finer raster are cut from coarse pixels, which are counted from its corner."""
+    generator = np.random.default_rng(0)
+    size = int(240 * pixels_per_meter)
+    layers = (generator.random((3, size, size)) < 0.05).astype(np.uint8)
+    whole = Raster(layers, np.array([300.0, 400.0]), pixels_per_meter)
+    for _ in range(5):
+        position = whole.origin + generator.uniform(100, 140, (1, 2))
+        part, heading = crop(whole, position), generator.uniform(-3, 3, 1)
+        assert part.layers.size < 0.6 * layers.size
+        shown, expected = (cut_patches(one, position, heading, geometry, 0.5) for one in (part, whole))
+        np.testing.assert_allclose(shown, expected, atol=1e-5)
 
 
 def test_off_the_map_nothing_is_driveable() -> None:
