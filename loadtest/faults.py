@@ -45,7 +45,7 @@ class Victim:
     server: Server
     models: Path
     record: Path
-    timeout: float = TIMEOUT
+    timeout: float
     """Seconds that its callers wait for a response."""
     limits: dict[int, tuple[int, int]] = field(default_factory=dict)
     """Former limits of the process, by resource."""

@@ -18,7 +18,7 @@ from model.scenes.raster import (
     PATCH_PIXELS_PER_METER,
     PATCH_SIZE,
     ROWS_BEHIND,
-    cut_patches,
+    raster_view,
 )
 
 _CHUNK = {"cpu": 8}
@@ -50,8 +50,8 @@ def agent_frame_patches(cache: Cache, rows: Ints, names: Collection[str]) -> dic
         raster = cache.raster(scene)
         position, heading = cache.position[rows[here]], cache.heading[rows[here]]
         for name in names:
-            patches = cut_patches(raster, position, heading, PATCHES[name], OUTSIDE)
-            made[name][here] = torch.from_numpy(patches).mul_(2).sub_(1)
+            view = raster_view(raster, position, heading, PATCHES[name], OUTSIDE)
+            made[name][here] = torch.from_numpy(view.cut())
     return made
 
 

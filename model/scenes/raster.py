@@ -203,7 +203,7 @@ def map_view(
         return MapView(geometry, outside, None, 1.0, unseen, np.zeros(len(targets)), own)
     states = scene.states
     position, heading = states.position[targets, -1], states.heading[targets, -1]
-    return replace(_raster_view(scene.raster, position, heading, geometry, outside), given=own)
+    return replace(raster_view(scene.raster, position, heading, geometry, outside), given=own)
 
 
 def map_patches(
@@ -241,7 +241,7 @@ def cut_patches(
     Raises:
         ValueError: a position or heading is not finite.
     """
-    patches = _raster_view(raster, position, heading, geometry, outside).cut()
+    patches = raster_view(raster, position, heading, geometry, outside).cut()
     patches += 1
     patches /= 2
     return patches.clip(0, 1, out=patches)  # rounding
@@ -260,10 +260,10 @@ def coarsening(pixels_per_meter: float, geometry: PatchGeometry) -> int:
     return max(int(pixels_per_meter / geometry.pixels_per_meter), 1)
 
 
-def _raster_view(
+def raster_view(
     raster: Raster, position: Floats, heading: Floats, geometry: PatchGeometry, outside: float
 ) -> MapView:
-    """Return the view of N agents on a raster, see ``cut_patches``."""
+    """Return the view of N agents on a raster; ``cut_patches`` explains the arguments and what it raises."""
     if not (np.isfinite(position).all() and np.isfinite(heading).all()):
         raise ValueError("a map patch needs a finite position and heading")
     size = np.array(raster.layers.shape[1:])

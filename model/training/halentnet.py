@@ -20,7 +20,7 @@ from model.networks.cvae import AgentNetwork
 from model.scenes.scene import AgentType
 from model.training.config import TrainingConfig
 from model.training.discriminator import Discriminator, Verdict
-from model.training.learner import AgentFrameLearner, Batch, CvaeLearner, Learner, perturbed
+from model.training.learner import AgentFrameLearner, Batch, CvaeLearner, Learner, perturbed, set_rate
 from model.training.mixture_objective import step_log_density
 from model.training.objectives import LossWeights
 from model.training.processes import average_gradients
@@ -170,8 +170,7 @@ class HalentLearner(Learner):
     def step(self, batches: Sequence[Batch], weights: LossWeights, rate: float) -> dict[str, Tensor]:
         for_discriminator, for_generator, for_cvae = batches
         if self._full_rate is not None:
-            for group in self.discriminator_optimizer.param_groups:
-                group["lr"] = DISCRIMINATOR_RATE * rate / self._full_rate
+            set_rate(self.discriminator_optimizer, DISCRIMINATOR_RATE * rate / self._full_rate)
         terms = self.train_discriminator(for_discriminator, weights)
         terms |= self.train_generator(for_generator, weights, rate)
         return terms | self._learner.step([for_cvae], weights, rate)

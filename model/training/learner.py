@@ -105,8 +105,7 @@ class DescentLearner(Learner):
 
     def descend(self, loss: Tensor, rate: float) -> None:
         """Do one optimiser step on a loss."""
-        for group in self.optimizer.param_groups:
-            group["lr"] = rate * group.get("rate_factor", 1.0)
+        set_rate(self.optimizer, rate)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         average_gradients(self.networks.parameters())
@@ -183,6 +182,12 @@ def perturbed(batch: Batch, config: TrainingConfig) -> Batch:
     for name in features.keys() & {"map", "far_map"}:
         features[name] = unpack_patches(features[name])
     return Batch(*(jitter(features, future) if config.jitter else (features, future)))
+
+
+def set_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
+    """Set the learning rate of all parameter groups; ``rate_factor`` multiplies that of a group."""
+    for group in optimizer.param_groups:
+        group["lr"] = rate * group.get("rate_factor", 1.0)
 
 
 def _groups(networks: nn.Module, map_rate_factor: float) -> list[dict[str, object]]:
